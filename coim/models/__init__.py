@@ -1,0 +1,21 @@
+"""Networks: the design-conditioned policy and critics, the dynamics ensemble, and the stack they are made of."""
+
+from .ensemble import GaussianEnsemble
+from .normaliser import RunningNormaliser
+from .policy import Policy, PolicyNetwork, make_policy
+from .qvalue import QValue, QValueNetwork, make_qvalue
+from .stacked import StackedLinear, StackedMLP, select_run
+
+__all__ = [
+    "GaussianEnsemble",
+    "Policy",
+    "PolicyNetwork",
+    "QValue",
+    "QValueNetwork",
+    "RunningNormaliser",
+    "StackedLinear",
+    "StackedMLP",
+    "make_policy",
+    "make_qvalue",
+    "select_run",
+]

@@ -1,0 +1,80 @@
+"""Running statistics by which networks see their inputs and targets centred and scaled.
+
+Shapes: ``B`` batch, ``K`` runs, ``F`` features.
+
+References:
+    Chan, Golub, LeVeque 1983, Algorithms for Computing the Sample Variance: the merge of two sets of rows.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class RunningNormaliser(nn.Module):
+    """Mean and standard deviation of all rows ever seen, feature by feature, in float64.
+
+    Args:
+        num_features: ``F``.
+        num_runs: ``K`` independent statistics, or None.
+        min_std: lower bound of the standard deviation of each feature, ``[F]``; zero by default.
+
+    Note:
+        A feature that never varied by more than a millionth (of its mean, where that is above 1) is centred but not
+        scaled.
+
+    Example:
+        >>> normaliser = RunningNormaliser(2)
+        >>> normaliser.update(torch.tensor([[0.0, 7.0], [4.0, 7.0]]))
+        >>> normaliser(torch.tensor([6.0, 8.0]))
+        tensor([2., 1.])
+    """
+
+    count: Tensor
+    mean: Tensor
+    square_sum: Tensor
+    min_std: Tensor
+
+    def __init__(self, num_features: int, *, num_runs: int | None = None, min_std: Tensor | None = None) -> None:
+        super().__init__()
+        self.num_runs = num_runs
+        shape = (num_features,) if num_runs is None else (num_runs, num_features)
+        self.register_buffer("count", torch.zeros((*shape[:-1], 1), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(shape, dtype=torch.float64))
+        self.register_buffer("square_sum", torch.zeros(shape, dtype=torch.float64))
+        floor = torch.zeros(num_features) if min_std is None else min_std
+        self.register_buffer("min_std", floor.to(torch.float64).expand(shape).clone())
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation of each feature, ``[(K,) F]``; ones where nothing was seen or nothing varied."""
+        std = (self.square_sum / self.count.clamp(min=1)).sqrt()
+        varied = std > 1e-6 * self.mean.abs().clamp(min=1)
+        return torch.where(varied | (self.min_std > 0), std.maximum(self.min_std), torch.ones_like(std))
+
+    @torch.no_grad()
+    def update(self, rows: Tensor) -> None:
+        """Merge rows into the statistics, in place.
+
+        Args:
+            rows: ``[*B, (K,) F]``, any number of them.
+        """
+        rows = rows.to(self.mean.dtype).reshape(-1, *self.mean.shape)
+        if not len(rows):
+            return
+        batch_mean = rows.mean(0)
+        shift, total = batch_mean - self.mean, self.count + len(rows)
+        self.square_sum += (rows - batch_mean).square().sum(0) + shift.square() * self.count * len(rows) / total
+        self.mean += shift * len(rows) / total
+        self.count.copy_(total)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Standardise ``[*B, (K,) F]``, in the dtype of ``x``."""
+        return (x - self.mean.to(x.dtype)) / self.std.to(x.dtype)
+
+    def keep_run(self, run: int) -> None:
+        """Drop all runs but one, in place; see :func:`~coim.models.select_run`."""
+        for name, buffer in list(self.named_buffers()):
+            setattr(self, name, buffer[run].clone())
+        self.num_runs = None

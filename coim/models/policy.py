@@ -1,0 +1,121 @@
+"""The design-conditioned policy pi(a | s, xi), a tanh-Gaussian.
+
+Shapes: ``B`` batch, ``K`` runs, ``S`` state, ``D`` design, ``A`` action.
+
+References:
+    Haarnoja et al. 2018, Soft Actor-Critic (arXiv:1801.01290), [9] of the paper: the tanh-Gaussian.
+    rlkit (github.com/rail-berkeley/rlkit), on which the paper's baseline [16] builds: the range of the log-scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import InteractionType, TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from .stacked import StackedMLP
+
+LOG_SCALE_RANGE = (-20.0, 2.0)  # rlkit's LOG_SIG_MIN, LOG_SIG_MAX
+
+
+class PolicyNetwork(nn.Module):
+    """Tensor-level policy: ``(observation, design) -> (loc, scale)`` of the Gaussian before the tanh.
+
+    Args:
+        num_observations: ``S``.
+        num_designs: ``D``.
+        num_actions: ``A``.
+        num_cells: units of each hidden layer.
+        num_runs: ``K``, or None for a single run.
+    """
+
+    def __init__(
+        self,
+        num_observations: int,
+        num_designs: int,
+        num_actions: int,
+        *,
+        num_cells: Sequence[int] = (200, 200, 200),
+        num_runs: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.mlp = StackedMLP(num_observations + num_designs, 2 * num_actions, num_cells, num_runs=num_runs)
+
+    def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
+        """Evaluate the network.
+
+        Args:
+            observation: ``[*B, (K,) S]``.
+            design: ``[*B, (K,) D]``.
+
+        Returns:
+            ``loc`` and ``scale``, each ``[*B, (K,) A]``; ``scale`` lies in ``exp(LOG_SCALE_RANGE)``.
+        """
+        loc, log_scale = self.mlp(observation, design).chunk(2, -1)
+        return loc, log_scale.clamp(*LOG_SCALE_RANGE).exp()
+
+
+class Policy(ProbabilisticActor):
+    """The policy as a TorchRL actor: reads ``observation``, ``design``; writes ``loc``, ``scale``, ``action`` and
+    ``action_log_prob``.
+
+    It samples by default; under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it acts by ``tanh(loc)``.
+    Actions lie in [-1, 1].
+
+    Args:
+        network: ``(observation, design) -> (loc, scale)``, kept as ``policy.network``.
+    """
+
+    def __init__(self, network: PolicyNetwork) -> None:
+        super().__init__(
+            TensorDictModule(network, in_keys=["observation", "design"], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+            default_interaction_type=InteractionType.RANDOM,
+        )
+
+    @property
+    def network(self) -> PolicyNetwork:
+        """The tensor-level network."""
+        return self.module[0].module
+
+    @property
+    def num_runs(self) -> int | None:
+        """``K``, or None for a single run."""
+        return self.network.mlp.num_runs
+
+
+def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num_runs: int | None = None) -> Policy:
+    """Build a policy that fits an environment (Sec. 6.1: three hidden layers of 200 units).
+
+    Args:
+        env: anything with ``observation_spec["observation"]``, ``design_spec`` and ``action_spec``; only the sizes of
+            their last dimensions and the action's bounds are read.
+        num_cells: units of each hidden layer.
+        num_runs: ``K`` independent policies in one; the last batch dimension of their input is then the run axis.
+
+    Raises:
+        ValueError: if the actions of ``env`` are not bounded by -1 and 1.
+
+    Example:
+        >>> policy = Policy(PolicyNetwork(17, 6, 6))
+        >>> loc, scale = policy.network(torch.zeros(256, 17), torch.ones(256, 6))
+        >>> loc.shape
+        torch.Size([256, 6])
+    """
+    space = env.action_spec.space
+    if space is None or not (torch.all(space.low == -1) and torch.all(space.high == 1)):
+        raise ValueError(f"a tanh acts in [-1, 1], not in {space}; rescale with torchrl.envs.ActionScaling")
+    network = PolicyNetwork(
+        env.observation_spec["observation"].shape[-1],
+        env.design_spec.shape[-1],
+        env.action_spec.shape[-1],
+        num_cells=num_cells,
+        num_runs=num_runs,
+    )
+    return Policy(network)

@@ -1,0 +1,102 @@
+"""The design-conditioned critics Q(s, a, xi).
+
+Shapes: ``B`` batch, ``K`` runs, ``N`` critics, ``S`` state, ``A`` action, ``D`` design.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from .stacked import StackedMLP
+
+
+class QValueNetwork(nn.Module):
+    """Tensor-level critics: ``(observation, action, design) -> values``.
+
+    Args:
+        num_observations: ``S``.
+        num_actions: ``A``.
+        num_designs: ``D``.
+        num_critics: ``N``, critics with weights of their own.
+        num_cells: units of each hidden layer.
+        num_runs: ``K``, or None for a single run.
+    """
+
+    def __init__(
+        self,
+        num_observations: int,
+        num_actions: int,
+        num_designs: int,
+        *,
+        num_critics: int = 2,
+        num_cells: Sequence[int] = (200, 200, 200),
+        num_runs: int | None = None,
+    ) -> None:
+        super().__init__()
+        size = num_observations + num_actions + num_designs
+        self.mlp = StackedMLP(size, 1, num_cells, num_runs=num_runs, num_copies=num_critics)
+
+    def forward(self, observation: Tensor, action: Tensor, design: Tensor) -> Tensor:
+        """Evaluate all critics.
+
+        Args:
+            observation: ``[*B, (K,) S]``.
+            action: ``[*B, (K,) A]``.
+            design: ``[*B, (K,) D]``.
+
+        Returns:
+            ``[*B, (K,) N]``.
+        """
+        return self.mlp(observation, action, design).squeeze(-1)
+
+
+class QValue(TensorDictModule):
+    """The critics as a TensorDict module: reads ``observation``, ``action``, ``design``; writes ``state_action_value``.
+
+    With one critic its output ``[*B, 1]`` is what TorchRL's losses expect of a critic.
+
+    Args:
+        network: kept as ``qvalue.module``.
+    """
+
+    def __init__(self, network: QValueNetwork) -> None:
+        super().__init__(network, in_keys=["observation", "action", "design"], out_keys=["state_action_value"])
+
+    @property
+    def num_runs(self) -> int | None:
+        """``K``, or None for a single run."""
+        return self.module.mlp.num_runs
+
+
+def make_qvalue(
+    env: EnvBase, *, num_critics: int = 2, num_cells: Sequence[int] = (200, 200, 200), num_runs: int | None = None
+) -> QValue:
+    """Build critics that fit an environment (Sec. 6.1: three hidden layers of 200 units).
+
+    Args:
+        env: anything with ``observation_spec["observation"]``, ``design_spec`` and ``action_spec``; only the sizes of
+            their last dimensions are read.
+        num_critics: ``N``; two in the double-Q approach of Sec. 4.
+        num_cells: units of each hidden layer.
+        num_runs: ``K`` independent sets of critics in one; the last batch dimension of their input is then the run
+            axis.
+
+    Example:
+        >>> import torch
+        >>> qvalue = QValue(QValueNetwork(17, 6, 6))
+        >>> qvalue.module(torch.zeros(256, 17), torch.zeros(256, 6), torch.ones(256, 6)).shape
+        torch.Size([256, 2])
+    """
+    network = QValueNetwork(
+        env.observation_spec["observation"].shape[-1],
+        env.action_spec.shape[-1],
+        env.design_spec.shape[-1],
+        num_critics=num_critics,
+        num_cells=num_cells,
+        num_runs=num_runs,
+    )
+    return QValue(network)

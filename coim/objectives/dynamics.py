@@ -1,0 +1,113 @@
+r"""Training of the dynamics ensemble, Eq. 6.
+
+Shapes: ``B`` batch, ``K`` runs, ``E`` members, ``S`` state.
+
+References:
+    Co-Imagination of Behaviour & Morphology of Agents, Eq. 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from .functional import gaussian_nll
+from .runs import check_batch, check_num_runs, split_runs
+
+
+class EnsembleNLLLoss(LossModule):
+    """Negative log-likelihood of the transitions under each member of the ensemble, J_p of Eq. 6.
+
+    ``loss_dynamics`` is the mean over the batch and the sum over members (and runs), so that each member gets the
+    gradient it would have had alone.  It is taken on the standardised target of the ensemble: that shifts Eq. 6 by a
+    constant and weighs all entries of the observation alike.
+
+    Args:
+        ensemble: a :class:`~coim.models.GaussianEnsemble`, or any TensorDict module that writes ``mean`` and
+            ``log_var``, ``[*B, (K,) E, S]``, and has ``standardised_target(observation, next_observation)``.
+        num_runs: ``K``, the last batch dimension; None averages over the whole batch.
+
+    Raises:
+        ValueError: if ``num_runs`` is not that of the ensemble.
+
+    Note:
+        All members see the same rows.  Chua et al. [3] draw a bootstrap of the data for each member instead; here
+        members differ by their initial weights alone.
+
+    Example:
+        >>> import torch
+        >>> from coim.models import GaussianEnsemble
+        >>> loss = EnsembleNLLLoss(GaussianEnsemble(11, 3, 4, num_cells=(8, 8)))
+        >>> rows = TensorDict({"observation": torch.zeros(256, 11), "action": torch.zeros(256, 3)}, [256])
+        >>> rows["design"], rows["next", "observation"] = torch.ones(256, 4), torch.ones(256, 11)
+        >>> loss(rows)["loss_dynamics"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes.
+
+        Attributes:
+            observation: state; its successor is read at ``("next", observation)``.
+            mean: written by the ensemble.
+            log_var: written by the ensemble.
+        """
+
+        observation: NestedKey = "observation"
+        mean: NestedKey = "mean"
+        log_var: NestedKey = "log_var"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    out_keys = ["loss_dynamics"]  # noqa: RUF012, TorchRL's convention
+
+    ensemble: TensorDictModuleBase
+    ensemble_params: TensorDictParams
+    target_ensemble_params: TensorDictParams
+
+    def __init__(self, ensemble: TensorDictModuleBase, *, num_runs: int | None = None) -> None:
+        super().__init__()
+        check_num_runs(num_runs, ensemble)
+        self.num_runs = num_runs
+        self.convert_to_functional(ensemble, "ensemble")
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What is read: the inputs of the ensemble and the next observation."""
+        return [*self.ensemble.in_keys, unravel_key(("next", self.tensor_keys.observation))]
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        """There is no value estimator."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor]) -> EnsembleNLLLoss:
+        """Move to a device or dtype, and the ensemble along: its running statistics stay those of the loss."""
+        super()._apply(fn)
+        self.ensemble_params.to_module(self.ensemble)
+        return self
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss.
+
+        Args:
+            tensordict: ``[*B, (K)]`` rows of Replay_Pop; left as it is.
+
+        Returns:
+            A TensorDict with the scalar ``loss_dynamics``.
+        """
+        observation = tensordict[self.tensor_keys.observation]
+        check_batch(observation.shape[:-1], self.num_runs)
+        next_observation = tensordict[unravel_key(("next", self.tensor_keys.observation))]
+        with self.ensemble_params.to_module(self.ensemble, preserve_module_state=False):
+            out = self.ensemble(tensordict.select(*self.ensemble.in_keys))
+            target = self.ensemble.standardised_target(observation, next_observation)
+        mean, log_var = out[self.tensor_keys.mean], out[self.tensor_keys.log_var]
+        nll = gaussian_nll(mean, log_var, target.unsqueeze(-2)).sum(-1)  # members
+        return TensorDict({"loss_dynamics": split_runs(nll, self.num_runs).mean(0).sum()})

@@ -1,0 +1,47 @@
+"""The run axis in a loss: the mean goes over the rows of a run, the sum over runs.
+
+So each run gets exactly the gradient that it would have had alone.
+
+Shapes: ``B`` batch, ``K`` runs, ``R`` rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+
+def check_num_runs(num_runs: int | None, *networks: nn.Module) -> None:
+    """Refuse a loss whose number of runs is not that of its networks: their gradients would be scaled by 1 / K.
+
+    Args:
+        num_runs: ``K`` of the loss.
+        networks: those that declare no ``num_runs`` are taken as they are.
+
+    Raises:
+        ValueError: naming the network.
+    """
+    for network in networks:
+        runs = getattr(network, "num_runs", num_runs)
+        if runs != num_runs:
+            raise ValueError(
+                f"num_runs={num_runs}, but {type(network).__name__} was built with num_runs={runs}; they must be equal"
+            )
+
+
+def check_batch(batch: Sequence[int], num_runs: int | None) -> None:
+    """Refuse a batch, ``[*B, (K)]``, of which no loss can be taken.
+
+    Raises:
+        ValueError: if the last dimension is not the run axis or there are no rows.
+    """
+    if num_runs is not None and (not batch or batch[-1] != num_runs):
+        raise ValueError(f"a batch of size {list(batch)} needs num_runs={num_runs} as its last dimension")
+    if 0 in batch:
+        raise ValueError(f"a batch of size {list(batch)} has no rows; a mean needs at least one")
+
+
+def split_runs(rows: Tensor, num_runs: int | None) -> Tensor:
+    """Bring one number per row, ``[*B, (K)]``, into the shape ``[R, K]``; ``[R, 1]`` without a run axis."""
+    return rows.reshape(-1, num_runs or 1)

@@ -1,0 +1,253 @@
+r"""Training of policy and critics on real and imagined rows, Eq. 7-8; Eq. 3-4 when nothing is imagined.
+
+Shapes: ``B`` batch, ``K`` runs, ``N`` critics, ``A`` action, ``R`` rows.
+
+References:
+    Co-Imagination of Behaviour & Morphology of Agents, Eq. 3, 4, 7, 8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictParams,
+    dispatch,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+from torchrl.objectives import LossModule
+from torchrl.objectives.sac import compute_rsample_log_prob
+
+from .functional import bellman_target, mixing_weights, policy_loss, qvalue_loss, soft_value
+from .runs import check_batch, check_num_runs, split_runs
+
+
+class CriticList(TensorDictModuleBase):
+    """Single critics side by side: their values, each ``[*B, 1]``, joined to ``[*B, N]``.
+
+    Args:
+        critics: TensorDict modules that all write ``key``.
+        key: where the values are.
+    """
+
+    def __init__(self, critics: Sequence[TensorDictModule], *, key: NestedKey = "state_action_value") -> None:
+        super().__init__()
+        self.critics = nn.ModuleList(critics)
+        self.in_keys = list(dict.fromkeys(k for critic in critics for k in critic.in_keys))
+        self.out_keys = [key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the values of all critics."""
+        values = [critic(tensordict.copy())[self.out_keys[0]] for critic in self.critics]
+        return tensordict.set(self.out_keys[0], torch.cat(values, -1))
+
+
+class CoImSACLoss(LossModule):
+    r"""Soft actor-critic over real and imagined rows, Eq. 7-8.
+
+    ``loss_qvalue`` is J_Q with the printed one half, summed over the critics; ``loss_actor`` is J_pi with the minimum
+    of the critics.  Both are means over the batch (and sums over runs).  With ``mix="batch"`` and a fixed temperature
+    they equal ``0.5 * SACLoss(loss_function="l2")`` and ``SACLoss`` of TorchRL.
+
+    Target critics start equal to the critics and follow them by :class:`torchrl.objectives.SoftUpdate`.
+
+    Args:
+        policy: writes an action given what it reads; needs ``get_dist``.
+        qvalue: one module whose values have the critics as their last dimension, ``[*B, (K,) N]``, or a list of
+            single critics.
+        alpha: entropy temperature (Sec. 6.1), fixed.
+        gamma: discount.
+        mix: ``"batch"`` takes one mean over real and imagined rows (Sec. 5), ``"sum"`` adds the mean over the imagined
+            rows to the mean over the real ones (Eq. 7-8 as printed).
+        num_runs: ``K``, the last batch dimension; None averages over the whole batch.
+
+    Raises:
+        ValueError: if ``mix`` is unknown, a number is out of its range, or ``num_runs`` is not that of the networks.
+
+    Note:
+        Two optional entries: ``imagined`` (bool, ``[*B, 1]``; absent: all rows are real) and, for tests and common
+        random numbers, ``noise`` and ``("next", "noise")`` (``[*B, A]``), the :math:`\epsilon_t` of the actor's and
+        of the target's action.
+
+    Example:
+        >>> from coim.models import Policy, PolicyNetwork, QValue, QValueNetwork
+        >>> from torchrl.objectives import SoftUpdate
+        >>> policy, qvalue = Policy(PolicyNetwork(11, 4, 3)), QValue(QValueNetwork(11, 3, 4))
+        >>> loss = CoImSACLoss(policy, qvalue, alpha=0.01, gamma=0.99)
+        >>> targets = SoftUpdate(loss, tau=0.005)
+        >>> step = {"observation": torch.zeros(256, 11), "design": torch.ones(256, 4)}
+        >>> rows = TensorDict({**step, "action": torch.zeros(256, 3), "next": step}, [256])
+        >>> rows["next", "reward"] = torch.ones(256, 1)
+        >>> rows["next", "terminated"] = torch.zeros(256, 1, dtype=torch.bool)
+        >>> out = loss(rows)
+        >>> sorted(out.keys())
+        ['entropy', 'loss_actor', 'loss_qvalue']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes; those of the next step are read under ``"next"``.
+
+        Attributes:
+            action: stored action, and where the critics read the policy's.
+            design: taken from the current step where ``("next", design)`` is absent.
+            state_action_value: written by the critics.
+            reward: of the next step.
+            terminated: of the next step; the only flag that cuts the bootstrap.
+            imagined: whether a row was imagined.
+            noise: standard normal of the policy's action.
+        """
+
+        action: NestedKey = "action"
+        design: NestedKey = "design"
+        state_action_value: NestedKey = "state_action_value"
+        reward: NestedKey = "reward"
+        terminated: NestedKey = "terminated"
+        imagined: NestedKey = "imagined"
+        noise: NestedKey = "noise"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    out_keys = ["loss_actor", "loss_qvalue", "entropy"]  # noqa: RUF012, TorchRL's convention
+
+    policy: ProbabilisticTensorDictSequential
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+    qvalue: TensorDictModule
+    qvalue_params: TensorDictParams
+    target_qvalue_params: TensorDictParams
+
+    def __init__(
+        self,
+        policy: ProbabilisticTensorDictSequential,
+        qvalue: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        alpha: float = 0.01,
+        gamma: float = 0.99,
+        mix: Literal["batch", "sum"] = "batch",
+        num_runs: int | None = None,
+    ) -> None:
+        super().__init__()
+        if mix not in ("batch", "sum"):
+            raise ValueError(f"mix={mix!r} is unknown; choose 'batch' or 'sum'")
+        if not 0 <= gamma <= 1:
+            raise ValueError(f"gamma={gamma} is outside [0, 1]; Sec. 6.1 has 0.99")
+        if not alpha >= 0:
+            raise ValueError(f"alpha={alpha} is below 0; Sec. 6.1 has 0.01, 0 switches the entropy off")
+        if not isinstance(qvalue, nn.Module):
+            qvalue = CriticList(qvalue)
+        check_num_runs(num_runs, policy, qvalue)
+        self.alpha, self.gamma, self.mix, self.num_runs = alpha, gamma, mix, num_runs
+        self.convert_to_functional(policy, "policy")
+        self.convert_to_functional(qvalue, "qvalue", create_target_params=True)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What must be there: the inputs of the networks, action, reward, terminated; the policy's inputs next."""
+        keys = self.tensor_keys
+        after = [*self.policy.in_keys, keys.reward, keys.terminated]
+        now = [*self.policy.in_keys, *self.qvalue.in_keys, keys.action]
+        return list(dict.fromkeys([*now, *(unravel_key(("next", key)) for key in after)]))
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        """There is no value estimator; a list of critics writes where they write."""
+        if isinstance(self.qvalue, CriticList):
+            self.qvalue.out_keys = [self.tensor_keys.state_action_value]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute both losses.
+
+        Args:
+            tensordict: ``[*B, (K)]`` transitions; left as they are.
+
+        Returns:
+            The scalars ``loss_actor``, ``loss_qvalue`` and, for the log, ``entropy`` (nats, mean over all rows).
+        """
+        check_batch(tensordict[self.tensor_keys.action].shape[:-1], self.num_runs)
+        loss_qvalue = self.qvalue_loss(tensordict)  # first the target's draw, then the actor's, as TorchRL does
+        loss_actor, log_prob = self.actor_loss(tensordict)
+        return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "entropy": -log_prob.mean()})
+
+    def qvalue_loss(self, tensordict: TensorDictBase) -> Tensor:
+        """J_Q of Eq. 7, a scalar; gradient for the critics alone."""
+        target = self._td_target(tensordict)
+        with self.qvalue_params.to_module(self.qvalue, preserve_module_state=False):
+            q = self._values(tensordict)
+        return self._expectation(qvalue_loss(q, target), tensordict)
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """J_pi of Eq. 8, a scalar with gradient for the policy alone, and the log-densities, ``[*B, (K)]``."""
+        action, log_prob = self._act(tensordict)
+        with self.qvalue_params.data.to_module(self.qvalue, preserve_module_state=False):
+            q = self._values(tensordict, action)
+        loss = self._expectation(policy_loss(q, log_prob, self.alpha), tensordict)
+        return loss, log_prob.detach()
+
+    @torch.no_grad()
+    def _td_target(self, tensordict: TensorDictBase) -> Tensor:
+        after = tensordict["next"].copy()
+        design = tensordict.get(self.tensor_keys.design, None)
+        if design is not None and self.tensor_keys.design not in after.keys(True):
+            after.set(self.tensor_keys.design, design)
+        action, log_prob = self._act(after)
+        with self.target_qvalue_params.to_module(self.qvalue, preserve_module_state=False):
+            value = soft_value(self._values(after, action), log_prob, self.alpha)
+        reward, terminated = after[self.tensor_keys.reward], after[self.tensor_keys.terminated]
+        return bellman_target(reward.squeeze(-1), terminated.squeeze(-1), value, self.gamma)
+
+    def _act(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            self.policy_params.to_module(self.policy, preserve_module_state=False),
+        ):
+            dist = self.policy.get_dist(tensordict.select(*self.policy.in_keys))
+        noise = tensordict.get(self.tensor_keys.noise, None)
+        return compute_rsample_log_prob(dist) if noise is None else reparametrised(dist, noise)
+
+    def _values(self, tensordict: TensorDictBase, action: Tensor | None = None) -> Tensor:
+        if action is None:
+            inputs = tensordict.select(*self.qvalue.in_keys)
+        else:
+            inputs = tensordict.select(*(key for key in self.qvalue.in_keys if key != self.tensor_keys.action))
+            inputs.set(self.tensor_keys.action, action)
+        return self.qvalue(inputs)[self.tensor_keys.state_action_value]
+
+    def _expectation(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mean over the batch in the sense of ``mix``, sum over runs."""
+        imagined = tensordict.get(self.tensor_keys.imagined, None)
+        imagined = torch.zeros_like(rows, dtype=torch.bool) if imagined is None else imagined.squeeze(-1)
+        rows, imagined = split_runs(rows, self.num_runs), split_runs(imagined, self.num_runs)
+        return (mixing_weights(imagined, self.mix, dtype=rows.dtype) * rows).sum()
+
+
+def reparametrised(dist: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Action and log-density of a policy for given noise, by the arithmetic of TanhNormal.rsample_and_log_prob.
+
+    Args:
+        dist: the policy's distribution.
+        noise: standard normal, ``[*B, A]``.
+
+    Returns:
+        The action, ``[*B, A]``, and its log-density in nats, ``[*B]``.
+
+    Raises:
+        TypeError: if the distribution is not a TanhNormal.
+    """
+    if not isinstance(dist, TanhNormal):
+        raise TypeError(f"noise is for TanhNormal policies, not {type(dist).__name__}; leave the key away to sample")
+    preimage = dist.loc + noise * dist.scale
+    transform = dist.transforms[0]
+    action = transform(preimage)
+    return action, dist.base_dist.log_prob(preimage) - transform.log_abs_det_jacobian(preimage, action).sum(-1)

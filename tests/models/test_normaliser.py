@@ -1,0 +1,43 @@
+import torch
+
+from coim.models import RunningNormaliser
+
+
+def test_merged_batches_have_the_statistics_of_all_rows():
+    rows = torch.randn(100, 3, dtype=torch.float64) * torch.tensor([1.0, 10.0, 0.1]) + torch.tensor([0.0, 1e4, -5.0])
+    normaliser = RunningNormaliser(3)
+    for batch in rows.split([1, 40, 7, 52]):
+        normaliser.update(batch)
+    torch.testing.assert_close(normaliser.mean, rows.mean(0), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(normaliser.std, rows.std(0, correction=0), rtol=1e-9, atol=0)
+    assert normaliser.count.item() == 100
+
+
+def test_each_run_has_statistics_of_its_own():
+    rows = torch.randn(4, 5, 2, 3, dtype=torch.float64)
+    fleet, alone = RunningNormaliser(3, num_runs=2), RunningNormaliser(3)
+    fleet.update(rows)
+    alone.update(rows[:, :, 1])
+    torch.testing.assert_close(fleet.mean[1], alone.mean)
+    torch.testing.assert_close(fleet.std[1], alone.std)
+    torch.testing.assert_close(fleet(rows)[:, :, 1], alone(rows[:, :, 1]))
+
+
+def test_before_any_row_nothing_is_changed():
+    x = torch.randn(4, 3)
+    normaliser = RunningNormaliser(3)
+    normaliser.update(torch.zeros(0, 3))
+    assert torch.equal(normaliser(x), x)
+
+
+def test_a_feature_that_never_varied_is_centred_but_not_scaled():
+    normaliser = RunningNormaliser(2)
+    normaliser.update(torch.tensor([[1.41, 0.0], [1.41, 2.0]]))
+    assert normaliser.std.tolist() == [1.0, 1.0]
+    torch.testing.assert_close(normaliser(torch.tensor([2.0, 3.0])), torch.tensor([0.59, 2.0]))
+
+
+def test_the_standard_deviation_has_a_floor():
+    normaliser = RunningNormaliser(2, min_std=torch.tensor([0.5, 0.0]))
+    normaliser.update(torch.tensor([[1.0, 1.0], [1.02, 1.02]]))
+    torch.testing.assert_close(normaliser.std, torch.tensor([0.5, 0.01], dtype=torch.float64), rtol=1e-4, atol=0)

@@ -1,0 +1,115 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from coim.models import make_policy, make_qvalue
+from coim.objectives import DesignValue
+
+
+@pytest.fixture
+def parts(toy_env, make_rows):
+    """Policy, critics and seven start states."""
+    policy = make_policy(toy_env, num_cells=(8,)).double()
+    qvalue = make_qvalue(toy_env, num_cells=(8,)).double()
+    return policy, qvalue, make_rows(7).select("observation", "design")
+
+
+def designs(num: int) -> torch.Tensor:
+    return torch.rand(num, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.5
+
+
+@pytest.mark.parametrize("chunk_size", [1, 3, 28])
+def test_it_is_a_loop_over_designs_and_start_states(parts, chunk_size):
+    policy, qvalue, starts = parts
+    expected = []
+    for design in designs(10):
+        values = []
+        for observation in starts["observation"]:
+            loc, _ = policy.network(observation, design)
+            values.append(qvalue.module(observation, loc.tanh(), design).min())
+        expected.append(torch.stack(values).mean())
+    ours = DesignValue(policy, qvalue, starts, chunk_size=chunk_size)(designs(10))
+    torch.testing.assert_close(ours, torch.stack(expected), rtol=1e-12, atol=1e-13)
+    assert not ours.requires_grad
+
+
+def test_closed_form():
+    policy = TensorDictModule(lambda s, xi: s + xi, in_keys=["observation", "design"], out_keys=["action"])
+    qvalue = TensorDictModule(
+        lambda a, xi: torch.cat([a * xi, a + 100], -1), in_keys=["action", "design"], out_keys=["state_action_value"]
+    )
+    fitness = DesignValue(policy, qvalue, TensorDict({"observation": torch.tensor([[1.0], [3.0]])}, [2]))
+    assert fitness(torch.tensor([[1.0], [2.0]])).tolist() == [3.0, 8.0]  # 1 (2 + 4) / 2, 2 (3 + 5) / 2
+
+
+def test_it_is_differentiable_in_the_designs_and_in_nothing_else(parts):
+    policy, qvalue, starts = parts
+    fitness = DesignValue(policy, qvalue, starts)
+    xi = designs(5).requires_grad_()
+    assert torch.autograd.gradcheck(fitness, (xi,))
+    fitness(xi).sum().backward()
+    assert (xi.grad != 0).all()
+    assert all(p.grad is None for p in (*policy.parameters(), *qvalue.parameters()))
+
+
+def test_it_follows_the_networks_as_they_train(parts):
+    policy, qvalue, starts = parts
+    fitness = DesignValue(policy, qvalue, starts)
+    before = fitness(designs(5))
+    qvalue.module.mlp.layers[-1].bias.data += 1.0
+    torch.testing.assert_close(fitness(designs(5)), before + 1.0)
+
+
+def test_the_action_is_deterministic_whatever_the_caller_explores(parts):
+    fitness = DesignValue(*parts)
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert torch.equal(fitness(designs(5)), fitness(designs(5)))
+
+
+def test_the_design_of_the_start_states_is_replaced(parts):
+    policy, qvalue, starts = parts
+    without = DesignValue(policy, qvalue, starts.select("observation"))
+    assert torch.equal(DesignValue(policy, qvalue, starts)(designs(5)), without(designs(5)))
+
+
+def test_a_tensordict_goes_in_and_comes_out(parts):
+    fitness, rows = DesignValue(*parts), TensorDict({"design": designs(5)}, [5])
+    assert torch.equal(fitness(rows)["design_value"], fitness(designs(5)))
+    assert list(rows.keys()) == ["design"]
+
+
+def test_nested_keys():
+    policy = TensorDictModule(lambda xi: xi, in_keys=[("body", "xi")], out_keys=["action"])
+    qvalue = TensorDictModule(lambda a, s: a + s, in_keys=["action", "observation"], out_keys=[("critic", "q")])
+    fitness = DesignValue(policy, qvalue, TensorDict({"observation": torch.tensor([[1.0], [3.0]])}, [2]))
+    fitness.set_keys(design=("body", "xi"), state_action_value=("critic", "q"))
+    assert fitness(torch.tensor([[1.0]])).tolist() == [3.0]
+
+
+def test_a_fleet_is_refused(toy_env, parts):
+    with pytest.raises(ValueError, match="Policy was built with num_runs=7"):
+        DesignValue(make_policy(toy_env, num_runs=7), *parts[1:])
+
+
+def test_bad_input_is_named(parts):
+    policy, qvalue, starts = parts
+    fitness = DesignValue(policy, qvalue, starts)
+    with pytest.raises(ValueError, match=r"designs of shape \[4, 3\] must be \[P, 2\]"):
+        fitness(torch.ones(4, 3))
+    with pytest.raises(ValueError, match=r"designs of shape \[2\] must be \[P, 2\]"):
+        fitness(torch.ones(2))
+    broken = designs(4)
+    broken[2, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"designs \[2\] have NaN"):
+        fitness(broken)
+    with pytest.raises(ValueError, match=r"batch size \[0\]; give \[n\] rows of Replay_s0, at least one"):
+        DesignValue(policy, qvalue, starts[:0])
+    with pytest.raises(ValueError, match=r"batch size \[7, 1\]"):
+        DesignValue(policy, qvalue, starts.unsqueeze(1))
+    with pytest.raises(ValueError, match="chunk_size=0 must be at least 1"):
+        DesignValue(policy, qvalue, starts, chunk_size=0)
+    starts["observation"][0, 0] = torch.inf
+    with pytest.raises(ValueError, match=r"NaN or infinite entries in \['observation'\]"):
+        DesignValue(policy, qvalue, starts)
