@@ -1,0 +1,139 @@
+"""A fleet of MuJoCo simulations, each with a body of its own, stepped by native threads.
+
+Shapes: K simulations, D design, nq positions, nv velocities, nu motors.
+
+Numpy and MuJoCo only. How a body is built, and what counts as a broken simulation, is decided here and nowhere else.
+
+References:
+    Todorov, Erez, Tassa: MuJoCo: A physics engine for model-based control, IROS 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+ROOT_X, ROOT_Z, PITCH = 0, 1, 2  # qpos of the root: two slides in m and a hinge in rad
+BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: no working body gets near, and MuJoCo itself complains only from 1e10 on
+
+
+class Simulations:
+    """K simulations of bodies that differ in their lengths.
+
+    Args:
+        drawn: the body as drawn, xi = 1.
+
+    Keyword Args:
+        shape_body: turns a body as drawn into the body of a design ``[D]``, in place.
+        designs: the first designs, ``[K, D]``.
+        num_threads: native threads that share the simulations; they do not change the results.
+
+    Attributes:
+        qpos: joint positions, ``[K, nq]`` float64. Live, as all arrays here: a write is the state that the next step
+            starts from.
+        qvel: joint velocities, ``[K, nv]``.
+        ctrl: motor commands, ``[K, nu]``.
+        state: everything a simulation carries from step to step, ``[K, n]``: to copy rows is to copy simulations.
+    """
+
+    def __init__(
+        self,
+        drawn: mujoco.MjSpec,
+        *,
+        shape_body: Callable[[mujoco.MjSpec, np.ndarray], None],
+        designs: np.ndarray,
+        num_threads: int,
+    ) -> None:
+        self._drawn, self._shape_body = drawn, shape_body
+        self._models = [self.body(design).compile() for design in designs]
+        self._batch = Batch(self._models[0], len(designs), num_threads)
+        self._batch.set_models(self._models)
+        self.state: np.ndarray = self._batch.state
+        self.qpos, self.qvel, self.ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self._warnings = self._batch.warning[:, :, 1]  # how often each kind of warning came, [K, kinds]
+        # Time, positions and velocities are the first columns of the state.
+        moving = mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL
+        self._moving = self.state[:, : mujoco.mj_stateSize(self._models[0], int(moving))]
+        self._scratch = mujoco.MjData(self._models[0])
+        self._silence = mujoco.MjLogConfig.get()
+        self._silence.logto_file = self._silence.logto_console = False
+
+    def body(self, design: np.ndarray) -> mujoco.MjSpec:
+        """The body of a design ``[D]``, ready to be compiled (a third of a millisecond) or drawn."""
+        spec = self._drawn.copy()
+        self._shape_body(spec, np.asarray(design, dtype=np.float64))
+        return spec
+
+    def model(self, row: int) -> mujoco.MjModel:
+        """The compiled body of one simulation."""
+        return self._models[row]
+
+    def build(self, rows: np.ndarray, designs: np.ndarray) -> None:
+        """Give some simulations new bodies, ``designs [len(rows), D]``. Their states stay as they are.
+
+        Everything that depends on lengths (masses, inertias, bounding volumes, start pose) follows, because each body
+        is compiled from scratch: patching the fields of a model is faster, but half of them are stale if one is
+        forgotten.
+        """
+        for row, design in zip(rows, designs):
+            self._models[row] = self.body(design).compile()
+        self._batch.set_models(self._models)
+
+    def start(self, rows: np.ndarray) -> None:
+        """Put some simulations at the start of their bodies: at rest, with no memory of what was before."""
+        self._batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+
+    def step(self, num_steps: int) -> np.ndarray:
+        """Advance all simulations under their ``ctrl``.
+
+        A simulation breaks if MuJoCo warns of it or raises, or if a number in it is not finite or beyond 1e6 (m, rad,
+        m/s, rad/s). It is put back at its start; the others do not notice.
+
+        Returns:
+            Rows of the simulations that broke; almost always there are none.
+        """
+        failed = self._step_silently(num_steps)
+        # "not below" instead of "above": a comparison with NaN is false.
+        if failed.size or self._warnings.any() or not np.abs(self._moving).max() < BEYOND_PHYSICS:
+            return self._mend(failed)
+        return failed
+
+    def lift_out_of_floor(self, row: int) -> None:
+        """Raise a robot whose joints were moved so that it stands on the floor rather than in it."""
+        capsules = self.capsules(row)
+        lowest = (np.minimum(capsules[:, 1], capsules[:, 3]) - capsules[:, 4]).min()
+        if lowest < 0:
+            self.qpos[row, ROOT_Z] -= lowest  # rootz slides straight up
+
+    def capsules(self, row: int) -> np.ndarray:
+        """Where the segments of a planar body are: x and z of both ends and the radius in m, ``[segments, 5]``."""
+        model, data = self._models[row], self._scratch
+        data.qpos[:] = self.qpos[row]
+        mujoco.mj_kinematics(model, data)
+        shown = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+        centre, axis = data.geom_xpos[shown][:, [0, 2]], data.geom_xmat[shown][:, [2, 8]]
+        radius, half = model.geom_size[shown, :1], model.geom_size[shown, 1:2]
+        return np.hstack([centre - half * axis, centre + half * axis, radius])
+
+    def _step_silently(self, num_steps: int) -> np.ndarray:
+        """Step without MuJoCo's MUJOCO_LOG.TXT in the user's folder; :meth:`step` returns what it would say there."""
+        chosen_by_user = mujoco.MjLogConfig.get()
+        self._silence.set()
+        try:
+            self._batch.step(nstep=num_steps)
+        except SimulationError as error:
+            return np.asarray(error.ids)
+        finally:
+            chosen_by_user.set()
+        return np.empty(0, dtype=np.int64)
+
+    def _mend(self, failed: np.ndarray) -> np.ndarray:
+        """Find the broken rows and start them again, which clears their warnings too."""
+        broken = self._warnings.any(axis=1) | ~(np.abs(self._moving).max(axis=1) < BEYOND_PHYSICS)
+        broken[failed] = True
+        rows = np.flatnonzero(broken)
+        self.start(rows)
+        return rows

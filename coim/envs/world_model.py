@@ -1,0 +1,148 @@
+"""The learned dynamics driven as an environment: the dream.
+
+Shapes: ``*B`` any batch, ``S`` state, ``A`` action, ``D`` design.
+
+References:
+    Co-Imagination of Behaviour and Morphology of Agents: Eq. 6 and 7 (h), Sec. 3 (the reward function is given).
+
+    K. Chua et al., *Deep reinforcement learning in a handful of trials using probabilistic dynamics models*, NeurIPS
+    2018 (TS1: a member of the ensemble is drawn at each time step).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+from torchrl.envs import EnvBase
+
+
+class Dynamics(Protocol):
+    """What :class:`WorldModelEnv` asks of a model of the dynamics, such as :class:`coim.GaussianEnsemble`."""
+
+    def sample(
+        self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Draw next observations ``[*B, S]``: h(s, a, xi) of Eq. 7."""
+
+
+class WorldModelEnv(EnvBase):
+    """Not TorchRL's ``WorldModelEnv``: this one steps a learned transition model over (observation, action, design).
+
+    A step asks the model for the next observation and the real environment's reward function for the reward; the design
+    is carried along. Nothing terminates and nothing is truncated, as in the real episodes (Sec. 6.1); a horizon is
+    TorchRL's ``StepCounter``, or the ``max_steps`` of a rollout.
+
+    A reset takes the start states from its tensordict, ``{"observation": [*B, S], "design": [*B, D]}``. Without them it
+    goes back to the last ones given; before any were given to a made-up start: standard-normal observations and uniform
+    designs, good for checking specs and little else.
+
+    Args:
+        ensemble: the model; its ``sample`` gives next observations.
+        env: the real environment: gives the specs, ``design_spec`` and ``reward_fn``; it is not stepped. A bare one:
+            the dream knows nothing of transforms.
+        batch_size: of the dream, ``[*B]``: free to differ from ``env``'s, but a fleet of models has its run axis last.
+        seed: of the dream's own random numbers (TS1, noise, made-up starts). Drawn from torch if unset.
+
+    Raises:
+        ValueError: if a start state has an entry that is not finite, or a design that leaves the bounds.
+
+    Example:
+        >>> from coim import GaussianEnsemble, HopperMorph
+        >>> env = HopperMorph(seed=0)
+        >>> dream = WorldModelEnv(GaussianEnsemble.for_env(env, num_cells=(32,)), env, batch_size=[256], seed=0)
+        >>> start = TensorDict({"observation": torch.zeros(256, 11), "design": torch.ones(256, 4)}, [256])
+        >>> dream.rollout(5, auto_reset=False, tensordict=dream.reset(start))["next", "reward"].shape
+        torch.Size([256, 5, 1])
+    """
+
+    def __init__(self, ensemble: Dynamics, env: EnvBase, *, batch_size: Sequence[int], seed: int | None = None) -> None:
+        super().__init__(device=env.device, batch_size=torch.Size(batch_size))
+        self.ensemble = ensemble
+        self.reward_fn = env.reward_fn
+        self.design_spec: Bounded = env.design_spec
+        self._make_specs(env)
+        self._rng = torch.Generator(self.device or "cpu")
+        self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+        self._start = TensorDict({}, self.batch_size, device=self.device)
+
+    def advance(
+        self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Dream one step on tensors of any batch size; gradients flow.
+
+        Args:
+            observation: ``[*B, S]``.
+            action: ``[*B, A]``, in [-1, 1].
+            design: ``[*B, D]``.
+            generator: of random numbers; default: the dream's own.
+
+        Returns:
+            Next observation ``[*B, S]`` and reward ``[*B, 1]``.
+        """
+        rng = self._rng if generator is None else generator
+        next_observation = self.ensemble.sample(observation, action, design, generator=rng)
+        return next_observation, self.reward_fn(observation, action, next_observation, design)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        design = tensordict["design"]
+        next_observation, reward = self.advance(tensordict["observation"], tensordict["action"], design)
+        done = self.full_done_spec.zero()
+        return done.update({"observation": next_observation, "design": design, "reward": reward})
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        if tensordict is not None:
+            given = tensordict.select("observation", "design", strict=False)
+            self._check_start(given)
+            # Rows that are not reset keep their state: EnvBase.reset merges what is returned here by `_reset`.
+            self._start.update(given.clone())
+        if len(self._start.keys()) < 2:
+            self._start = self._made_up_start().update(self._start)
+        return self.full_done_spec.zero().update(self._start.clone())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._rng.manual_seed(seed)
+
+    def _make_specs(self, env: EnvBase) -> None:
+        """Give each of the real environment's specs the dream's batch size."""
+        single = env.full_observation_spec_unbatched
+        observed = Composite({key: single[key] for key in ("observation", "design")})
+        self.observation_spec = observed.expand(*self.batch_size)
+        # Both must also be state: only then do transforms and rollouts hand them to reset and step.
+        self.state_spec = observed.clone().expand(*self.batch_size)
+        self.action_spec = env.full_action_spec_unbatched.expand(*self.batch_size)
+        self.reward_spec = env.full_reward_spec_unbatched.expand(*self.batch_size)
+        self.done_spec = env.full_done_spec_unbatched.expand(*self.batch_size)
+
+    def _made_up_start(self) -> TensorDict:
+        """Draw a start for those who give none."""
+        low, high = self.design_spec.space.low, self.design_spec.space.high
+        observation = self.observation_spec["observation"].zero()
+        design = self.observation_spec["design"].zero()
+        uniform = torch.rand(design.shape, generator=self._rng, device=design.device, dtype=design.dtype)
+        start = {"observation": observation.normal_(generator=self._rng), "design": low + (high - low) * uniform}
+        return TensorDict(start, self.batch_size, device=self.device)
+
+    def _check_start(self, start: TensorDictBase) -> None:
+        """Say which entry of a start cannot be dreamt from."""
+        for key, value in start.items():
+            if value.shape != self.observation_spec[key].shape:
+                raise ValueError(
+                    f"start {key} has shape {list(value.shape)}, not {list(self.observation_spec[key].shape)}"
+                )
+            if not value.isfinite().all():
+                raise ValueError(f"start {key} holds {value[~value.isfinite()][0].item()}; give finite numbers")
+        if (design := start.get("design", None)) is None:
+            return
+        low, high = self.design_spec.space.low, self.design_spec.space.high
+        outside = ((design < low) | (design > high)).any(-1)
+        if outside.any():
+            raise ValueError(
+                f"design {design[outside][0].tolist()} leaves [{low.tolist()}, {high.tolist()}]; project it with "
+                "design_spec.project() to clip it"
+            )

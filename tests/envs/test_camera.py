@@ -1,0 +1,54 @@
+"""Pictures, where there is something to draw with; a sentence, where there is not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+PICTURES = """
+import numpy as np, torch
+from tensordict import TensorDict
+from coim.envs import HopperMorph
+env = HopperMorph(num_runs=2, seed=0)
+env.reset(TensorDict({"design": torch.tensor([[0.5] * 4, [2.0] * 4])}, [2]))
+try:
+    small, tall = env.render(0, width=160, height=120), env.render(1, width=160, height=120)
+except RuntimeError as error:
+    print("MISSING", error)
+else:
+    assert small.shape == tall.shape == (120, 160, 3) and small.dtype == np.uint8
+    orange = [((p[..., 0] > 1.2 * p[..., 2]).any(1).nonzero()[0]) for p in (small, tall)]
+    print("ROWS", *(len(rows) for rows in orange))
+"""
+
+
+def run(code: str, **environment: str) -> str:
+    clean = {
+        key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "DISPLAY", "PYOPENGL_PLATFORM")
+    }
+    out = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", code],
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return out.stdout
+
+
+def test_a_picture_shows_the_body_of_the_row_or_says_what_is_missing():
+    said = run(PICTURES, MUJOCO_GL="egl").split()
+    if said[0] == "MISSING":
+        assert "MUJOCO_GL=egl" in said
+    else:
+        small, tall = int(said[1]), int(said[2])
+        assert 2 * small < tall  # rows of the picture that the robot fills
+
+
+def test_without_opengl_one_sentence_says_what_to_set_and_to_install():
+    said = run(PICTURES)  # no screen and no MUJOCO_GL
+    assert said.startswith("MISSING no picture without OpenGL")
+    assert "MUJOCO_GL=egl" in said
+    assert "libegl1 libegl-mesa0" in said

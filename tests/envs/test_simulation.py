@@ -1,0 +1,113 @@
+"""The native fleet: what breaks a simulation, who notices, and what is left in the user's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch, SimulationError
+
+from coim.envs.simulation import Simulations
+
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body name="pole" pos="0 0 2">
+      <joint name="hinge" axis="0 1 0"/>
+      <geom name="pole" type="capsule" fromto="0 0 0 0 0 -1" size=".05" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def lengthen(spec: mujoco.MjSpec, design: np.ndarray) -> None:
+    spec.geom("pole").fromto = [0, 0, 0, 0, 0, -design[0]]
+
+
+def fleet(num_threads: int = 1, num: int = 4) -> Simulations:
+    designs = np.linspace(1, 2, num)[:, None]
+    spec = mujoco.MjSpec.from_string(PENDULUM)
+    simulations = Simulations(spec, shape_body=lengthen, designs=designs, num_threads=num_threads)
+    simulations.qpos[:] = 0.5
+    return simulations
+
+
+def test_each_row_has_the_body_of_its_design():
+    simulations = fleet()
+    assert [round(float(simulations.model(k).geom("pole").size[1]), 4) for k in range(4)] == [0.5, 0.6667, 0.8333, 1.0]
+    simulations.step(100)
+    assert (np.diff(simulations.qpos[:, 0]) > 0).all()  # the longer, the slower to fall from 0.5 rad
+
+
+def test_building_changes_only_the_rows_that_are_named():
+    simulations = fleet()
+    before = [simulations.model(k) for k in range(4)]
+    simulations.build(np.array([2]), np.array([[1.1]]))
+    assert [simulations.model(k) is before[k] for k in range(4)] == [True, True, False, True]
+    assert simulations.qpos.tolist() == [[0.5]] * 4
+
+
+@pytest.mark.parametrize("velocity", [np.nan, np.inf, 1e12, 2e6])
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_a_row_that_breaks_is_named_and_starts_again_and_no_other_row_notices(velocity, num_threads):
+    sound, broken = fleet(num_threads), fleet(num_threads)
+    broken.qvel[1] = velocity
+    assert sound.step(5).tolist() == []
+    assert broken.step(5).tolist() == [1]
+    assert (broken.qpos[1, 0], broken.qvel[1, 0]) == (0, 0)
+    others = [0, 2, 3]
+    np.testing.assert_array_equal(broken.state[others], sound.state[others])
+    assert broken.step(5).tolist() == []  # its warnings are cleared
+
+
+def test_a_row_in_which_mujoco_raises_is_named_too(monkeypatch):
+    simulations = fleet()
+
+    def raising_step(self: Batch, **kwargs: object) -> None:
+        raise SimulationError(np.array([2]), "stack overflow")
+
+    monkeypatch.setattr(Batch, "step", raising_step)
+    assert simulations.step(1).tolist() == [2]
+    assert simulations.qpos.ravel().tolist() == [0.5, 0.5, 0.0, 0.5]
+
+
+def test_a_broken_simulation_leaves_no_file_and_no_word_behind(tmp_path: Path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    simulations = fleet(num_threads=2)
+    simulations.qvel[:] = np.nan
+    assert simulations.step(1).size == 4
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_users_own_logging_is_as_it_was():
+    before = mujoco.MjLogConfig.get()
+    assert before.logto_file
+    fleet().step(1)
+    after = mujoco.MjLogConfig.get()
+    assert (after.logto_file, after.logto_console) == (before.logto_file, before.logto_console)
+
+
+def test_capsules_are_the_outline_of_the_body_as_it_stands():
+    simulations = fleet(num=1)  # 1 m long, radius 0.05 m, hanging at 2 m
+    simulations.qpos[0] = np.pi / 2  # swung up to the side of -x
+    ends = simulations.capsules(0)
+    np.testing.assert_allclose(ends, [[-1, 2, 0, 2, 0.05]], atol=1e-12)
+
+
+def test_lifting_moves_a_body_out_of_the_floor_and_leaves_others_alone():
+    spec = mujoco.MjSpec.from_string(
+        """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body>
+        <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 1" size=".1"/></body></worldbody></mujoco>"""
+    )
+    simulations = Simulations(spec, shape_body=lambda spec, design: None, designs=np.ones((2, 1)), num_threads=1)
+    simulations.qpos[:, 1] = [0.05, 0.3]  # the round end is 0.05 m in the floor, 0.2 m above it
+    for row in range(2):
+        simulations.lift_out_of_floor(row)
+    assert simulations.qpos[:, 1].tolist() == pytest.approx([0.1, 0.3])
