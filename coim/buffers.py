@@ -1,0 +1,299 @@
+"""The four replay buffers of Algorithm 1, their common schema, and the exact mixture of real and imagined rows.
+
+Shapes: ``T`` time steps (rows of a buffer), ``B`` rows of a batch, ``K`` runs, ``S`` state, ``A`` action, ``D`` design.
+
+A buffer is TorchRL's, with one element per time step. An element is ``[K]``-batched: a sample of B elements is
+``[B, K]`` and a run only ever sees its own rows. The same time steps are drawn for all runs.
+
+References:
+    Co-Imagination of Behaviour and Morphology of Agents: Sec. 5 (80 % real, 20 % imagined), Algorithm 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, RandomSampler, RoundRobinWriter, TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+
+ROW_KEYS: tuple[NestedKey, ...] = (
+    "observation",  # [*B, S] f32, s_t without the design
+    "design",  # [*B, D] f32, xi
+    "action",  # [*B, A] f32 in [-1, 1], a_t
+    ("next", "observation"),  # [*B, S] f32, s_{t+1}
+    ("next", "design"),  # [*B, D] f32, equal to `design`
+    ("next", "reward"),  # [*B, 1] f32
+    ("next", "terminated"),  # [*B, 1] bool, the only one that cuts the bootstrap
+    ("next", "truncated"),  # [*B, 1] bool
+    ("next", "done"),  # [*B, 1] bool
+)
+"""What a stored row consists of, in all four buffers."""
+
+
+def transition_rows(transitions: TensorDictBase) -> TensorDict:
+    """Keep of transitions what a buffer stores.
+
+    Args:
+        transitions: stepped tensordict, rollout or collector batch ``[*B]`` with at least :data:`ROW_KEYS`; anything
+            else in it (log-probabilities, step counts) is dropped.
+
+    Returns:
+        The rows, ``[*B]``, in a tensordict of their own; the tensors are shared with ``transitions``.
+
+    Raises:
+        ValueError: if an entry of the schema is missing.
+    """
+    missing = [key for key in ROW_KEYS if key not in transitions.keys(include_nested=True)]
+    if missing:
+        raise ValueError(
+            f"transitions lack {missing}; step an environment that has `design` in its observation spec, such as a "
+            "morph environment or WorldModelEnv, and pass what it returns"
+        )
+    return transitions.select(*ROW_KEYS)
+
+
+class TransitionBuffer(TensorDictReplayBuffer):
+    """TorchRL's replay buffer with one schema, a generator of its own and checkpoints of the filled part only.
+
+    Args:
+        capacity: elements it can hold; the oldest are overwritten.
+        num_runs: K, the batch size of an element.
+        seed: of the generator that draws samples.
+        device: where the rows live and samples are drawn.
+
+    Example:
+        >>> buffer = TransitionBuffer(100, num_runs=2, seed=0)
+        >>> row = torch.zeros(5, 2, 1)
+        >>> _ = buffer.extend(TensorDict({key: row for key in ROW_KEYS}, [5, 2]))
+        >>> sample_batches(buffer, batch_size=256, num_batches=3).shape
+        torch.Size([3, 256, 2])
+    """
+
+    def __init__(self, capacity: int, *, num_runs: int = 1, seed: int, device: torch.device | str = "cpu") -> None:
+        if capacity < 1:
+            raise ValueError(f"a buffer of {capacity} rows can hold nothing; pass a capacity of 1 or more")
+        super().__init__(
+            storage=LazyTensorStorage(capacity, device=device),
+            sampler=RandomSampler(),
+            # TensorDictReplayBuffer's own writer would store eight more bytes of row number in each row.
+            writer=RoundRobinWriter(),
+            generator=torch.Generator(device).manual_seed(seed),
+        )
+        self.capacity = capacity
+        self.num_runs = num_runs
+
+    def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> torch.Tensor:
+        """Store transitions; the argument is left as it is.
+
+        Args:
+            tensordicts: ``[T, K]``, as for :func:`transition_rows`.
+            update_priority: part of TorchRL's signature; there are no priorities here.
+
+        Returns:
+            Where the rows went.
+
+        Raises:
+            ValueError: if the batch is not ``[T, K]``, is longer than the capacity, or lacks an entry.
+        """
+        shape = tensordicts.batch_size
+        if len(shape) != 2 or shape[1] != self.num_runs:
+            raise ValueError(
+                f"rows have batch size {list(shape)}, [T, {self.num_runs}] is needed: time first, then the runs "
+                "(env.rollout returns [K, T]: transpose(0, 1) it)"
+            )
+        if shape[0] > self.capacity:
+            raise ValueError(f"{shape[0]} rows do not fit into a buffer of {self.capacity}; enlarge its capacity")
+        return super().extend(transition_rows(tensordicts), update_priority=update_priority)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the filled rows (views, not copies), the writer's place and the generator's state."""
+        rows = self[:].exclude("index").flatten_keys(".").to_dict() if len(self) else {}
+        return {"rows": rows, "writer": self.writer.state_dict(), "generator": self._rng.get_state()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the place of the buffer that :meth:`state_dict` was read from."""
+        self.empty()
+        rows: dict[str, torch.Tensor] = state_dict["rows"]
+        if rows:
+            batch_size = next(iter(rows.values())).shape[:2]
+            self.extend(TensorDict(rows, batch_size).unflatten_keys("."))
+        self.writer.load_state_dict(state_dict["writer"])
+        self._rng.set_state(state_dict["generator"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Buffers:
+    """The buffers that Algorithm 1 initialises first.
+
+    Example:
+        >>> from coim import HopperMorph
+        >>> env = HopperMorph(num_runs=2, seed=0)
+        >>> buffers = Buffers.for_env(env, pop_capacity=1000, ind_capacity=100, s0_capacity=10, art_capacity=50, seed=0)
+        >>> _ = buffers.pop.extend(env.rollout(20, auto_reset=True).transpose(0, 1))
+        >>> len(buffers.pop), len(buffers.art)
+        (20, 0)
+    """
+
+    pop: TransitionBuffer
+    """Replay_Pop: every transition of every design."""
+    ind: TransitionBuffer
+    """Replay_Ind: the transitions of the current design."""
+    s0: TransitionBuffer
+    """Replay_s0: the first transition of each episode."""
+    art: TransitionBuffer
+    """Replay_Art: imagined transitions, emptied and refilled after each episode."""
+
+    @classmethod
+    def for_env(
+        cls,
+        env: EnvBase,
+        *,
+        pop_capacity: int,
+        ind_capacity: int,
+        s0_capacity: int,
+        art_capacity: int,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ) -> Buffers:
+        """Make four empty buffers for the runs of an environment.
+
+        Args:
+            env: its batch size ``[K]`` is that of an element.
+            pop_capacity: time steps that Replay_Pop can hold; a Half-Cheetah row takes 215 bytes per run.
+            ind_capacity: time steps that Replay_Ind can hold.
+            s0_capacity: episodes that Replay_s0 can hold.
+            art_capacity: imagined rows that Replay_Art can hold, per run.
+            seed: the buffers draw with generators of their own, derived from it.
+            device: where all rows live.
+        """
+        capacities = {"pop": pop_capacity, "ind": ind_capacity, "s0": s0_capacity, "art": art_capacity}
+        if len(env.batch_size) != 1:
+            raise ValueError(f"the environment has batch size {list(env.batch_size)}, the buffers need [K], its runs")
+        seeds = torch.randint(2**62, (len(capacities),), generator=torch.Generator().manual_seed(seed)).tolist()
+        return cls(
+            **{
+                name: TransitionBuffer(capacity, num_runs=env.batch_size[0], seed=own_seed, device=device)
+                for (name, capacity), own_seed in zip(capacities.items(), seeds)
+            }
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of each buffer under its name, filled rows only."""
+        return {field.name: getattr(self, field.name).state_dict() for field in fields(self)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Fill the buffers as those that :meth:`state_dict` was read from."""
+        for field in fields(self):
+            getattr(self, field.name).load_state_dict(state_dict[field.name])
+
+
+def sample_batches(buffer: TensorDictReplayBuffer, *, batch_size: int = 256, num_batches: int = 1) -> TensorDict:
+    """Draw many batches in one call, uniformly and with replacement.
+
+    Args:
+        buffer: elements of batch size ``[K]``.
+        batch_size: B, elements per batch.
+        num_batches: batches drawn at once; fifty cost hardly more than one.
+
+    Returns:
+        ``[num_batches, B, K]`` rows without TorchRL's ``index``.
+
+    Raises:
+        ValueError: if the buffer is empty or a number is below 1.
+    """
+    if min(batch_size, num_batches) < 1:
+        raise ValueError(f"{num_batches} batches of {batch_size} rows: both numbers must be at least 1")
+    if len(buffer) == 0:
+        raise ValueError(f"{batch_size} rows are wanted of an empty buffer; extend() it with transitions first")
+    rows = buffer.sample(num_batches * batch_size)
+    return rows.exclude("index").unflatten(0, (num_batches, batch_size))
+
+
+def sample_mixture(
+    sources: Sequence[tuple[TensorDictReplayBuffer, int]],
+    num_batches: int = 1,
+    *,
+    imagined: TensorDictReplayBuffer | None = None,
+) -> TensorDict:
+    """Draw batches that are put together from several buffers, each with its exact number of rows.
+
+    Args:
+        sources: buffers and the rows that each gives to a batch, in the order in which they appear there. A buffer that
+            gives 0 rows may be empty.
+        num_batches: batches drawn at once.
+        imagined: which of the buffers holds imagined rows, Replay_Art; None writes no ``imagined``.
+
+    Returns:
+        ``[num_batches, B, K]`` rows, B the sum of all rows, with ``imagined`` ``[num_batches, B, K, 1]`` written.
+
+    Raises:
+        ValueError: if a buffer that is drawn from is empty, or there are no rows to draw.
+
+    Example:
+        >>> one, two = (TransitionBuffer(8, seed=0) for _ in range(2))
+        >>> rows = TensorDict({key: torch.zeros(8, 1, 1) for key in ROW_KEYS}, [8, 1])
+        >>> _ = one.extend(rows), two.extend(rows)
+        >>> sample_mixture([(one, 2), (two, 1)], imagined=two)["imagined"].flatten()
+        tensor([False, False,  True])
+    """
+    parts = []
+    for buffer, num_rows in sources:
+        if num_rows == 0:
+            continue
+        rows = sample_batches(buffer, batch_size=num_rows, num_batches=num_batches)
+        if imagined is not None:
+            flag = torch.full((*rows.batch_size, 1), buffer is imagined, device=rows["design"].device)
+            rows.set("imagined", flag)
+        parts.append(rows)
+    if not parts:
+        raise ValueError("a batch of 0 rows is asked for; let one of its sources give 1 or more")
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def sample_mixed(
+    real: TensorDictReplayBuffer,
+    imagined: TensorDictReplayBuffer,
+    *,
+    batch_size: int = 256,
+    share: float = 0.2,
+    num_batches: int = 1,
+) -> TensorDict:
+    """Draw the population's batches: 80 % real, 20 % imagined, exactly (Sec. 5).
+
+    With the defaults each batch is 205 real rows and then 51 imagined ones. (TorchRL's ``ReplayBufferEnsemble`` draws
+    the buffers at random, so that its shares hold on average only.)
+
+    Args:
+        real: Replay_Pop.
+        imagined: Replay_Art.
+        batch_size: B, rows per batch.
+        share: of imagined rows, in [0, 1]; they are the last ``round(share * B)``.
+        num_batches: batches drawn at once.
+
+    Returns:
+        ``[num_batches, B, K]`` rows with ``imagined`` ``[num_batches, B, K, 1]`` written.
+
+    Raises:
+        ValueError: if a buffer that is drawn from is empty, the share leaves [0, 1], or the batch is too small to hold
+            a row of each.
+    """
+    num_imagined = _rows_of_share(batch_size, share)
+    sources = [(real, batch_size - num_imagined), (imagined, num_imagined)]
+    return sample_mixture(sources, num_batches, imagined=imagined)
+
+
+def _rows_of_share(batch_size: int, share: float) -> int:
+    """Return how many rows of a batch the share stands for."""
+    if not 0.0 <= share <= 1.0:
+        raise ValueError(f"the share is {share}, it must be in [0, 1]: 0.2 is one imagined row in five")
+    rows = round(share * batch_size)
+    if 0.0 < share < 1.0 and rows in (0, batch_size):
+        raise ValueError(
+            f"a batch of {batch_size} rows is smaller than its parts: a share of {share} makes it "
+            f"{batch_size - rows} + {rows} rows; enlarge the batch, or set the share to 0 or 1"
+        )
+    return rows

@@ -1,0 +1,278 @@
+"""Where designs come from: the generators G of the imagination, and the search for the next body.
+
+Shapes: ``*B`` any batch, ``D`` design entries, ``P`` particles (candidate designs tried at once).
+
+A generator is a callable ``(design, *, rng=None) -> design`` (:class:`DesignGenerator`), a search an object with
+``maximise(fitness) -> (design, value)`` (:class:`DesignSearch`); one class with one method adds another of either.
+
+References:
+    Co-Imagination of Behaviour and Morphology of Agents: Eq. 5 (what the search maximises), Sec. 5 (the three G).
+
+    J. Kennedy and R. Eberhart, *Particle swarm optimization*, IEEE International Conference on Neural Networks, 1995;
+    as implemented in `pyswarms <https://pyswarms.readthedocs.io>`_.
+"""
+
+from __future__ import annotations
+
+import logging.config
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal, Protocol
+from unittest import mock
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.data import Bounded
+
+
+@contextmanager
+def _no_reports() -> Iterator[None]:
+    """Keep pyswarms' reporters from configuring logging, which would also open ``report.log`` in the working directory.
+
+    Every one of its modules and handlers makes a reporter, at import and at construction.
+    """
+    with mock.patch.object(logging.config, "dictConfig"):
+        yield
+
+
+with _no_reports():
+    from pyswarms.backend.generators import create_swarm
+    from pyswarms.backend.handlers import BoundaryHandler, VelocityHandler
+    from pyswarms.backend.operators import compute_pbest
+    from pyswarms.backend.swarms import Swarm
+    from pyswarms.backend.topology import Star
+
+
+class DesignGenerator(Protocol):
+    """What :func:`coim.imagine` asks for the designs of imagined rows: G of Eq. 7-8."""
+
+    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+        """Give each row the design ``[*B, D]`` that it is imagined with, from the ``[*B, D]`` that it was seen with."""
+
+
+class DesignSearch(Protocol):
+    """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`."""
+
+    def maximise(self, fitness: Callable[[Tensor], Tensor]) -> tuple[Tensor, float]:
+        """Return the best design ``[D]`` found and its fitness; ``fitness`` maps ``[P, D]`` to ``[P]``."""
+
+
+class KnownDesigns:
+    """G(xi) = xi: every row keeps the design that it was seen with (Sec. 6.3).
+
+    Example:
+        >>> KnownDesigns()(torch.tensor([[1.0, 1.5]]))
+        tensor([[1.0000, 1.5000]])
+    """
+
+    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+        """Return ``design`` itself, ``[*B, D]``; nothing is drawn."""
+        return design
+
+
+class NoisyDesigns:
+    """G(xi) = N(xi, sigma^2), clipped to the bounds (Sec. 6.4).
+
+    The paper leaves open what becomes of a draw outside of the bounds: it is clipped, entry by entry.
+
+    Args:
+        spec: bounds of one design, ``[D]``, as ``env.design_spec``.
+        sigma: standard deviation, the same for every entry, in units of the scale factors.
+
+    Raises:
+        ValueError: if ``spec`` is not one bounded design, or ``sigma`` is negative.
+
+    Example:
+        >>> spec = Bounded(low=0.8, high=2.0, shape=(2,))
+        >>> NoisyDesigns(spec, sigma=0.0)(torch.tensor([[1.0, 3.0]]))
+        tensor([[1., 2.]])
+    """
+
+    def __init__(self, spec: Bounded, *, sigma: float = 0.1) -> None:
+        if not sigma >= 0.0:
+            raise ValueError(f"sigma is {sigma}, a standard deviation is 0 or more; KnownDesigns() adds no noise")
+        self._low, self._high = _bounds(spec)
+        self.sigma = sigma
+
+    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+        """Return a noisy copy of ``design``, ``[*B, D]``, drawn with ``rng`` (default: torch's global generator)."""
+        low, high = _bounds_for(design, self._low, self._high)
+        noise = torch.randn(design.shape, generator=rng, dtype=design.dtype, device=design.device)
+        return (design + self.sigma * noise).clamp(low, high)
+
+
+class RandomDesigns:
+    """G(xi) = uniform(Xi): every row gets a fresh design from the whole design space (Sec. 6.4).
+
+    Also the exploration step of Algorithm 1.
+
+    Args:
+        spec: bounds of one design, ``[D]``, as ``env.design_spec``.
+
+    Raises:
+        ValueError: if ``spec`` is not one bounded design.
+
+    Example:
+        >>> spec = Bounded(low=0.8, high=2.0, shape=(2,))
+        >>> spec.is_in(RandomDesigns(spec)(torch.ones(2)))
+        tensor(True)
+    """
+
+    def __init__(self, spec: Bounded) -> None:
+        self._low, self._high = _bounds(spec)
+
+    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+        """Return uniform designs of ``design``'s shape ``[*B, D]``, drawn with ``rng`` (default: the global one)."""
+        low, high = _bounds_for(design, self._low, self._high)
+        uniform = torch.rand(design.shape, generator=rng, dtype=design.dtype, device=design.device)
+        # low + (high - low) * u can round to just above high.
+        return torch.minimum(low + (high - low) * uniform, high)
+
+
+class ParticleSwarm:
+    """Particle swarm with a global best, by pyswarms' operators (Sec. 4, "Design Optimisation").
+
+    All particles are evaluated in one call, ``[P, D] -> [P]``. The paper does not give the settings; these are its
+    baseline's (ksluck/Coadaptation), but for the bounds. There a particle that leaves the design space on one side
+    comes in again on the other (``bounds="periodic"``), and such a swarm does not settle on an edge: of six entries
+    whose sum is maximised it gets 11.3 to 11.5 of 12, and ``"nearest"`` gets 12.
+
+    The swarm has random numbers of its own, which go on from one call to the next. numpy's global state, the logging
+    configuration and the working directory, all of which pyswarms touches, are as before after each call.
+
+    Args:
+        spec: bounds of one design, ``[D]``, as ``env.design_spec``; its device and dtype are the candidates'.
+        num_particles: candidate designs per iteration.
+        num_iterations: moves of the swarm.
+        c1: pull towards the best place that the particle itself has seen.
+        c2: pull towards the best place that any particle has seen.
+        w: inertia, the share of its velocity that a particle keeps.
+        bounds: where a particle goes that has left the design space: to the nearest edge, or in on the other side.
+        seed: of the swarm's own random numbers; None takes fresh entropy.
+
+    Raises:
+        ValueError: if ``spec`` is not one bounded design, a number of particles or iterations is below 1, or ``bounds``
+            is an unknown option.
+
+    Note:
+        numpy's global state is exchanged while the swarm moves, so another thread that draws from it meanwhile draws
+        from the swarm's numbers. During ``fitness`` the global state is the caller's.
+
+    Example:
+        >>> search = ParticleSwarm(Bounded(low=0.8, high=2.0, shape=(2,)), num_particles=50, num_iterations=60, seed=0)
+        >>> design, value = search.maximise(lambda designs: -(designs - 1.5).square().sum(-1))
+        >>> design.round(decimals=2), round(value, 4)
+        (tensor([1.5000, 1.5000]), -0.0)
+    """
+
+    def __init__(
+        self,
+        spec: Bounded,
+        *,
+        num_particles: int = 700,
+        num_iterations: int = 250,
+        c1: float = 0.5,
+        c2: float = 0.3,
+        w: float = 0.9,
+        bounds: Literal["nearest", "periodic"] = "nearest",
+        seed: int | None = None,
+    ) -> None:
+        if min(num_particles, num_iterations) < 1:
+            raise ValueError(f"{num_particles} particles x {num_iterations} iterations: both must be at least 1")
+        if bounds not in ("nearest", "periodic"):
+            raise ValueError(f"bounds={bounds!r} is an unknown option; take 'nearest' or 'periodic'")
+        self._low, self._high = _bounds(spec)
+        self.bounds = bounds
+        self.num_particles = num_particles
+        self.num_iterations = num_iterations
+        self.options = {"c1": c1, "c2": c2, "w": w}
+        # pyswarms draws from numpy's global generator, whose state is of this legacy kind.
+        self._random_state: Any = np.random.RandomState(seed).get_state()
+
+    def maximise(self, fitness: Callable[[Tensor], Tensor]) -> tuple[Tensor, float]:
+        """Search the design of highest fitness.
+
+        Args:
+            fitness: maps candidates ``[P, D]``, always inside the bounds, to values ``[P]``; called without gradients.
+
+        Returns:
+            The best design tried, ``[D]``, and its value.
+
+        Raises:
+            ValueError: if the fitness returns another shape, or a value that is not finite.
+        """
+        limits = (self._low.double().cpu().numpy(), self._high.double().cpu().numpy())
+        with _no_reports():
+            star, edge, pace = Star(), BoundaryHandler(strategy=self.bounds), VelocityHandler(strategy="unmodified")
+        with self._own_random_numbers():
+            swarm: Swarm = create_swarm(self.num_particles, len(limits[0]), options=self.options, bounds=limits)
+        swarm.pbest_cost = np.full(self.num_particles, np.inf)
+        for _ in range(self.num_iterations):
+            swarm.current_cost = -self._evaluate(fitness, self._candidates(swarm.position))
+            swarm.pbest_pos, swarm.pbest_cost = compute_pbest(swarm)
+            swarm.best_pos, swarm.best_cost = star.compute_gbest(swarm)
+            with self._own_random_numbers():
+                swarm.velocity = star.compute_velocity(swarm, vh=pace)
+            swarm.position = star.compute_position(swarm, limits, edge)
+        return self._candidates(swarm.best_pos), -float(swarm.best_cost)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the swarm's random numbers; nothing else lives from one call to the next."""
+        _, key, position, *_ = self._random_state
+        return {"key": torch.from_numpy(key.astype(np.int64)), "position": int(position)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with the random numbers of :meth:`state_dict`."""
+        # Only uniform numbers are drawn, so there is never half of a normal pair to keep.
+        self._random_state = ("MT19937", state_dict["key"].numpy().astype(np.uint32), state_dict["position"], 0, 0.0)
+
+    def _candidates(self, position: np.ndarray) -> Tensor:
+        """Turn pyswarms' float64 places into designs, ``[*B, D]``, inside the bounds exactly."""
+        return torch.as_tensor(position, dtype=self._low.dtype, device=self._low.device).clamp(self._low, self._high)
+
+    def _evaluate(self, fitness: Callable[[Tensor], Tensor], designs: Tensor) -> np.ndarray:
+        """Call the fitness and check what it returns, ``[P, D] -> [P]``."""
+        with torch.no_grad():
+            values = fitness(designs)
+        if values.shape != designs.shape[:1]:
+            raise ValueError(
+                f"the fitness of {len(designs)} designs has shape {list(values.shape)}, [{len(designs)}] is needed: "
+                "return one value per design"
+            )
+        broken = ~values.isfinite()
+        if broken.any():
+            first = int(broken.nonzero()[0])
+            raise ValueError(
+                f"the fitness is {values[first].item()} for the design {designs[first].tolist()}, and not finite for "
+                f"{int(broken.sum())} of {len(designs)} designs: check the networks that compute it"
+            )
+        return values.double().cpu().numpy()
+
+    @contextmanager
+    def _own_random_numbers(self) -> Iterator[None]:
+        """Exchange numpy's global state for the swarm's, and back."""
+        outside = np.random.get_state()  # noqa: NPY002
+        np.random.set_state(self._random_state)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            self._random_state = np.random.get_state()  # noqa: NPY002
+            np.random.set_state(outside)  # noqa: NPY002
+
+
+def _bounds(spec: Bounded) -> tuple[Tensor, Tensor]:
+    """Return lowest and highest design, each ``[D]``, of a spec."""
+    if not hasattr(spec.space, "low") or len(spec.shape) != 1:
+        raise ValueError(f"{spec} is not the bounds of one design; pass env.design_spec, a Bounded of shape [D]")
+    return spec.space.low, spec.space.high
+
+
+def _bounds_for(design: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the bounds on ``design``'s device and in its dtype, or say that its length is wrong."""
+    if design.shape[-1:] != low.shape:
+        raise ValueError(
+            f"a design of shape {list(design.shape)} has not the {len(low)} entries of the design space; "
+            f"pass [*B, {len(low)}]"
+        )
+    return low.to(design), high.to(design)

@@ -1,0 +1,219 @@
+"""The four buffers.  T time steps, B batch, K runs, S state, A action, D design."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+
+from coim.buffers import (
+    ROW_KEYS,
+    Buffers,
+    TransitionBuffer,
+    sample_batches,
+    sample_mixed,
+    sample_mixture,
+    transition_rows,
+)
+
+CHEETAH = {"S": 17, "D": 6, "A": 6}
+
+
+def make_rows(T: int, K: int = 1, *, S: int = 2, D: int = 2, A: int = 1, first: float = 0.0) -> TensorDict:
+    """Rows whose observation is ``first + t`` at time t, plus 1000 times the run."""
+    time = first + torch.arange(T).float().view(T, 1, 1)
+    own = time + 1000 * torch.arange(K).float().view(1, K, 1)
+    flag = torch.zeros(T, K, 1, dtype=torch.bool)
+    after = {"observation": own.expand(T, K, S) + 1, "design": torch.ones(T, K, D), "reward": torch.zeros(T, K, 1)}
+    after |= {"terminated": flag, "truncated": flag, "done": flag}
+    row = {"observation": own.expand(T, K, S), "design": torch.ones(T, K, D), "action": torch.zeros(T, K, A)}
+    return TensorDict({**row, "next": after}, [T, K])
+
+
+def filled(T: int, K: int = 1, *, seed: int = 0, first: float = 0.0, capacity: int | None = None) -> TransitionBuffer:
+    buffer = TransitionBuffer(capacity or T, num_runs=K, seed=seed)
+    buffer.extend(make_rows(T, K, first=first))
+    return buffer
+
+
+def keys_of(rows: TensorDict) -> set[Any]:
+    return set(rows.keys(include_nested=True, leaves_only=True))
+
+
+def test_transition_rows_keep_the_schema_and_leave_the_input_alone() -> None:
+    transitions = make_rows(3).set("sample_log_prob", torch.zeros(3, 1)).set("step_count", torch.zeros(3, 1, 1))
+    before = keys_of(transitions)
+    rows = transition_rows(transitions)
+    assert keys_of(rows) == set(ROW_KEYS)
+    assert keys_of(transitions) == before
+    assert rows["observation"] is transitions["observation"]
+
+
+def test_transitions_without_a_design_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"lack \['design', \('next', 'design'\)\]"):
+        transition_rows(make_rows(3).exclude("design", ("next", "design")))
+
+
+def test_a_buffer_stores_the_schema_and_nothing_else() -> None:
+    buffer = TransitionBuffer(10, num_runs=2, seed=0)
+    rows = make_rows(4, 2).set("sample_log_prob", torch.zeros(4, 2))
+    buffer.extend(rows)
+    assert "index" not in rows
+    assert keys_of(buffer.sample(8).exclude("index")) == set(ROW_KEYS)
+
+
+def test_every_run_sees_its_own_rows_only() -> None:
+    sample = sample_batches(filled(50, 3), batch_size=256)
+    runs = sample["observation"].div(1000, rounding_mode="floor")
+    assert sample.batch_size == (1, 256, 3)
+    assert torch.equal(runs, torch.arange(3.0).view(1, 1, 3, 1).expand_as(runs))
+
+
+def test_many_batches_are_drawn_uniformly_in_one_call() -> None:
+    sample = sample_batches(filled(10), batch_size=200, num_batches=50)
+    assert sample.batch_size == (50, 200, 1)
+    counts = sample["observation"][..., 0].flatten().long().bincount(minlength=10)
+    assert counts.sum() == 10_000
+    assert (counts - 1000).abs().max() < 150  # five standard deviations
+
+
+def test_a_buffer_draws_from_its_own_generator_and_from_nothing_else() -> None:
+    before = torch.get_rng_state()
+    draws = [sample_batches(filled(1000, seed=seed), batch_size=32)["observation"] for seed in (1, 1, 2)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_default_mixture_is_205_real_and_51_imagined_rows_in_every_batch() -> None:
+    real, imagined = filled(300, 2), filled(80, 2, first=500)
+    batches = sample_mixed(real, imagined, num_batches=7)
+    assert batches.batch_size == (7, 256, 2)
+    assert keys_of(batches) == {*ROW_KEYS, "imagined"}
+    assert batches["imagined"].dtype == torch.bool
+    assert batches["imagined"].sum((1, 3)).tolist() == [[51, 51]] * 7
+    is_from_art = batches["observation"][..., :1] % 1000 >= 500
+    assert torch.equal(batches["imagined"], is_from_art)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (1.0, 256), (0.5, 128), (0.1, 26)])
+def test_a_share_is_rounded_to_rows(share: float, expected: int) -> None:
+    assert sample_mixed(filled(9), filled(9), share=share)["imagined"].sum() == expected
+
+
+def test_a_buffer_without_a_share_may_be_empty() -> None:
+    empty = TransitionBuffer(5, seed=0)
+    assert not sample_mixed(filled(9), empty, share=0.0)["imagined"].any()
+    assert sample_mixed(empty, filled(9), share=1.0)["imagined"].all()
+
+
+def test_a_mixture_of_three_buffers_keeps_their_order_and_marks_one() -> None:
+    ind, pop, art = filled(9), filled(9, first=100), filled(9, first=200)
+    batch = sample_mixture([(ind, 3), (pop, 2), (art, 1)], 4, imagined=art)
+    assert batch.batch_size == (4, 6, 1)
+    assert (batch["observation"][0, :, 0, 0] // 100).tolist() == [0, 0, 0, 1, 1, 2]
+    assert batch["imagined"][0, :, 0, 0].tolist() == [False] * 5 + [True]
+    assert "imagined" not in sample_mixture([(ind, 3), (pop, 2)])
+
+
+def test_stock_buffers_of_torchrl_can_be_mixed_too() -> None:
+    from torchrl.data import LazyTensorStorage
+
+    stock = TensorDictReplayBuffer(storage=LazyTensorStorage(10))
+    stock.extend(make_rows(10))
+    assert sample_mixed(stock, filled(9))["imagined"].sum() == 51
+
+
+def test_emptying_and_refilling_keeps_the_storage_and_shows_new_rows_only() -> None:
+    art = filled(100, capacity=100)
+    place = art.storage[:]["observation"].data_ptr()
+    art.empty()
+    assert len(art) == 0
+    art.extend(make_rows(40, first=500))
+    assert len(art) == 40
+    assert art.storage[:]["observation"].data_ptr() == place
+    assert sample_batches(art, batch_size=500)["observation"].min() >= 500
+
+
+def test_a_full_buffer_forgets_its_oldest_rows() -> None:
+    buffer = filled(8, capacity=10)
+    buffer.extend(make_rows(5, first=100))
+    assert sorted(buffer[:]["observation"][:, 0, 0].tolist()) == [3, 4, 5, 6, 7, 100, 101, 102, 103, 104]
+
+
+def test_six_and_a_half_million_cheetah_rows_fit_into_one_and_a_half_gigabytes() -> None:
+    buffer = TransitionBuffer(1000, seed=0)
+    buffer.extend(make_rows(1, **CHEETAH))
+    bytes_per_row = buffer.storage._storage.bytes() / 1000
+    assert bytes_per_row == 4 * (17 + 6 + 6 + 17 + 6 + 1) + 3
+    assert bytes_per_row <= 1.5e9 / 6.5e6
+
+
+def test_the_buffers_of_an_environment_share_its_runs_but_not_their_draws() -> None:
+    env = cast(EnvBase, SimpleNamespace(batch_size=torch.Size([3])))
+    buffers = Buffers.for_env(env, pop_capacity=40, ind_capacity=30, s0_capacity=20, art_capacity=10, seed=0)
+    each = [buffers.pop, buffers.ind, buffers.s0, buffers.art]
+    assert [buffer.capacity for buffer in each] == [40, 30, 20, 10]
+    for buffer in each:
+        buffer.extend(make_rows(10, 3))
+    draws = [sample_batches(buffer, batch_size=32)["observation"] for buffer in each]
+    assert not any(torch.equal(draws[i], draws[j]) for i in range(4) for j in range(i))
+
+
+def test_a_checkpoint_holds_the_filled_rows_and_sampling_goes_on(tmp_path: Path) -> None:
+    def make(seed: int) -> Buffers:
+        env = cast(EnvBase, SimpleNamespace(batch_size=torch.Size([2])))
+        return Buffers.for_env(env, pop_capacity=10, ind_capacity=10**6, s0_capacity=5, art_capacity=5, seed=seed)
+
+    buffers, resumed = make(0), make(1)
+    buffers.pop.extend(make_rows(8, 2))
+    buffers.pop.extend(make_rows(5, 2, first=100))  # past the end: the oldest row is in the middle
+    buffers.ind.extend(make_rows(3, 2))
+    resumed.ind.extend(make_rows(7, 2, first=300))
+    sample_batches(buffers.pop)
+    Checkpoint(buffers=buffers).save(tmp_path / "run")
+    assert sum(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file()) < 10**5
+    Checkpoint(buffers=resumed).load(tmp_path / "run")
+    for buffer, other in ((buffers.pop, resumed.pop), (buffers.ind, resumed.ind)):
+        buffer.extend(make_rows(1, 2, first=200))
+        other.extend(make_rows(1, 2, first=200))
+        assert (buffer[:].exclude("index") == other[:].exclude("index")).all()
+        assert (sample_batches(buffer) == sample_batches(other)).all()
+    assert len(resumed.art) == 0
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_outside_of_0_to_1_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match=rf"the share is {share}, it must be in \[0, 1\]"):
+        sample_mixed(filled(9), filled(9), share=share)
+
+
+def test_a_batch_smaller_than_its_parts_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"a batch of 2 rows is smaller than its parts.*2 \+ 0 rows"):
+        sample_mixed(filled(9), filled(9), batch_size=2, share=0.2)
+    with pytest.raises(ValueError, match="a batch of 0 rows"):
+        sample_mixture([(filled(9), 0)])
+    with pytest.raises(ValueError, match="both numbers must be at least 1"):
+        sample_batches(filled(9), batch_size=-1)
+
+
+def test_an_empty_buffer_is_named_when_it_is_drawn_from() -> None:
+    with pytest.raises(ValueError, match=r"36 rows are wanted of an empty buffer"):
+        sample_batches(TransitionBuffer(5, seed=0), batch_size=36)
+
+
+def test_rows_that_do_not_fit_are_refused() -> None:
+    buffer = TransitionBuffer(5, num_runs=2, seed=0)
+    with pytest.raises(ValueError, match=r"\[2, 4\], \[T, 2\] is needed"):
+        buffer.extend(make_rows(2, 4))
+    with pytest.raises(ValueError, match="6 rows do not fit into a buffer of 5"):
+        buffer.extend(make_rows(6, 2))
+    with pytest.raises(ValueError, match="a buffer of 0 rows"):
+        TransitionBuffer(0, seed=0)
