@@ -1,0 +1,54 @@
+"""Co-imagination of behaviour and morphology: components that improve a robot's body and controller together.
+
+Everything that is public, in one flat list. Importing it starts nothing, reads nothing and prints nothing.
+"""
+
+from coim.buffers import Buffers, TransitionBuffer, sample_batches, sample_mixed, transition_rows
+from coim.coadaptation import CoAdaptation, DesignChosen, DesignDone, EpisodeDone, Event
+from coim.designs import DesignGenerator, DesignSearch, KnownDesigns, NoisyDesigns, ParticleSwarm, RandomDesigns
+from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, WorldModelEnv
+from coim.episode import run_episode
+from coim.imagination import imagine
+from coim.learner import DynamicsLearner, SACLearner
+from coim.models import GaussianEnsemble, Policy, QValue, StackedMLP, make_policy, make_qvalue, select_run
+from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Buffers",
+    "CoAdaptation",
+    "CoImSACLoss",
+    "DesignChosen",
+    "DesignDone",
+    "DesignGenerator",
+    "DesignSearch",
+    "DesignValue",
+    "DynamicsLearner",
+    "EnsembleNLLLoss",
+    "EpisodeDone",
+    "Event",
+    "GaussianEnsemble",
+    "HalfCheetahMorph",
+    "HopperMorph",
+    "KnownDesigns",
+    "MorphEnv",
+    "NoisyDesigns",
+    "ParticleSwarm",
+    "Policy",
+    "QValue",
+    "RandomDesigns",
+    "SACLearner",
+    "StackedMLP",
+    "TransitionBuffer",
+    "WalkerMorph",
+    "WorldModelEnv",
+    "imagine",
+    "make_policy",
+    "make_qvalue",
+    "run_episode",
+    "sample_batches",
+    "sample_mixed",
+    "select_run",
+    "transition_rows",
+]

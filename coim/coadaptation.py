@@ -1,0 +1,392 @@
+"""Algorithm 1: behaviour, design and dynamics learnt together, one body after the other.
+
+`CoAdaptation` is an iterator over events. It draws nothing, logs nothing and stops when nobody asks for the next event;
+networks, bodies, buffers and searches are passed in.
+
+Shapes: U updates, B batch, T steps, K runs, I first designs, D design, S observation.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Algorithm 1, Sec. 5 and 6.1.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coim.buffers import Buffers, sample_mixture
+from coim.designs import DesignGenerator, DesignSearch, RandomDesigns
+from coim.envs.morph import MorphEnv
+from coim.envs.world_model import WorldModelEnv
+from coim.episode import run_episode
+from coim.imagination import imagine
+from coim.learner import DynamicsLearner, SACLearner
+from coim.models.stacked import select_run
+from coim.objectives.design import DesignValue
+
+Kind = Literal["first", "optimised", "random"]
+
+UPDATES_PER_SAMPLE = 50  # batches drawn in one call: the replay's fixed cost is paid once for all of them
+
+
+@dataclass(frozen=True)
+class DesignChosen:
+    """A body is about to be built.
+
+    Attributes:
+        index: 0 for the first.
+        kind: one of the first designs, the optimum of Eq. 5, or a random one.
+        design: ``[K, D]``.
+        predicted: Eq. 5 at this design before anything is learnt on it, ``[K]``; None while there is no start state.
+    """
+
+    index: int
+    kind: Kind
+    design: Tensor
+    predicted: Tensor | None
+
+
+@dataclass(frozen=True)
+class EpisodeDone:
+    """One training episode, the updates after it, and one evaluation episode.
+
+    Attributes:
+        index: of the design.
+        kind: of the design.
+        episode: 0 for the design's first.
+        design: ``[K, D]``.
+        training_return: undiscounted, of the sampled actions, ``[K]``.
+        evaluation_return: undiscounted, of the deterministic individual policy, ``[K]``.
+        env_steps: training steps of one run so far; evaluation steps are not counted, nothing is learnt from them.
+        imagined: rows in Replay_Art of one run.
+        metrics: per-run means over the updates: losses, entropies, ``model_error``.
+        seconds: wall-clock by part.
+    """
+
+    index: int
+    kind: Kind
+    episode: int
+    design: Tensor
+    training_return: Tensor
+    evaluation_return: Tensor
+    env_steps: int
+    imagined: int
+    metrics: dict[str, float]
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True)
+class DesignDone:
+    """All episodes of a design are over.
+
+    Attributes:
+        index: of the design.
+        kind: of the design.
+        design: ``[K, D]``.
+        best_return: highest evaluation return, ``[K]``: the figure of merit of the paper's Fig. 1.
+    """
+
+    index: int
+    kind: Kind
+    design: Tensor
+    best_return: Tensor
+
+
+Event = DesignChosen | EpisodeDone | DesignDone
+
+
+@dataclass
+class Stopwatch:
+    """Seconds spent per named part."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _since: float = field(default_factory=time.perf_counter)
+
+    def lap(self, part: str) -> None:
+        """Book the time since the last lap to a part."""
+        now = time.perf_counter()
+        self.seconds[part] = self.seconds.get(part, 0.0) + now - self._since
+        self._since = now
+
+    def restart(self) -> None:
+        """Count from now on."""
+        self._since = time.perf_counter()
+
+    def read(self) -> dict[str, float]:
+        """What was booked since the last read."""
+        seconds, self.seconds = self.seconds, {}
+        return seconds
+
+
+class CoAdaptation:
+    """Algorithm 1 as an iterator over events; the model-free baseline is the same without ``dream`` and ``generator``.
+
+    Args:
+        env: bodies to train on, K runs in lock-step.
+        evaluation_env: bodies of its own for the evaluation episodes, so that evaluating changes nothing in training.
+        population: learner that sees all designs.
+        individual: learner that sees the current design; starts each design from the population's weights.
+        buffers: Replay_Pop, Replay_Ind, Replay_s0 and Replay_Art.
+        search: maximises Eq. 5 over the design space.
+        first_designs: ``[I, D]`` bodies that every run tries first.
+        dynamics: learns p~ from Replay_Pop after each episode; None learns none.
+        dream: where transitions are imagined; given together with ``generator``.
+        generator: G, the designs that are imagined.
+        num_designs: M, first designs included.
+        first_episodes: episodes on each of the first designs.
+        episodes: episodes on every later design.
+        individual_updates: updates of the individual learner per episode.
+        population_updates: updates of the population learner per episode.
+        model_updates: updates of the ensemble per episode.
+        batch_size: rows in a batch of any of them.
+        imagined_share: share of a population batch drawn from Replay_Art (Sec. 5).
+        individual_mix: share of an individual batch drawn from Replay_Pop ("primarily", Sec. 4; 0 in Algorithm 1).
+        individual_imagined_share: share of an individual batch drawn from Replay_Art. Algorithm 1 cites Eq. 7-8 for the
+            individual networks too, Sec. 5 gives imagined rows to the population alone; 0 follows Sec. 5.
+        num_start_states: n, start states that Eq. 5 averages over.
+        imagined_rows: rows in Replay_Art after a refresh; None takes one for each imagined row of the coming updates.
+        seed: seeds the generators of the actions, the imagination and the random designs.
+
+    Raises:
+        ValueError: if a count is below its least value, a share outside [0, 1], shares leave no row, first designs have
+            the wrong shape, or only one of ``dream`` and ``generator`` is given.
+
+    Note:
+        Evaluation episodes leave no trace in the replay. The predecessor's code also skips training in the first three
+        episodes of a design and population training in the first designs; the paper has no such rule.
+    """
+
+    def __init__(
+        self,
+        env: MorphEnv,
+        evaluation_env: MorphEnv,
+        *,
+        population: SACLearner,
+        individual: SACLearner,
+        buffers: Buffers,
+        search: DesignSearch,
+        first_designs: Tensor,
+        dynamics: DynamicsLearner | None = None,
+        dream: WorldModelEnv | None = None,
+        generator: DesignGenerator | None = None,
+        num_designs: int = 55,
+        first_episodes: int = 300,
+        episodes: int = 100,
+        individual_updates: int = 1000,
+        population_updates: int = 250,
+        model_updates: int = 250,
+        batch_size: int = 256,
+        imagined_share: float = 0.2,
+        individual_mix: float = 0.0,
+        individual_imagined_share: float = 0.0,
+        num_start_states: int = 36,
+        imagined_rows: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        if (dream is None) != (generator is None):
+            raise ValueError("imagining needs both a dream and a generator; give both, or neither for the baseline")
+        counts = {
+            "num_designs": num_designs,
+            "first_episodes": first_episodes,
+            "episodes": episodes,
+            "batch_size": batch_size,
+            "num_start_states": num_start_states,
+        }
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} is {count}, it must be at least 1")
+        updates = {"individual": individual_updates, "population": population_updates, "model": model_updates}
+        for name, count in updates.items():
+            if count < 0:
+                raise ValueError(f"{name}_updates is {count}, it must be at least 0 (0 does not train)")
+        if first_designs.ndim != 2 or first_designs.shape[1:] != env.design_spec.shape:
+            raise ValueError(
+                f"first_designs has shape {list(first_designs.shape)}, expected [I, {env.design_spec.shape[0]}]"
+            )
+        low, high = env.design_spec.space.low, env.design_spec.space.high
+        if not ((low <= first_designs) & (first_designs <= high)).all():
+            raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")
+        self.env, self.evaluation_env = env, evaluation_env
+        self.population, self.individual, self.dynamics = population, individual, dynamics
+        self.buffers, self.search, self.first_designs = buffers, search, first_designs
+        self.dream, self.generator = dream, generator
+        self.num_designs, self.first_episodes, self.episodes = num_designs, first_episodes, episodes
+        self.individual_updates, self.population_updates, self.model_updates = updates.values()
+        imagines = generator is not None
+        self.population_parts = batch_parts(batch_size, imagined=imagined_share * imagines)
+        self.individual_parts = batch_parts(
+            batch_size, imagined=individual_imagined_share * imagines, other=individual_mix
+        )
+        self.batch_size, self.num_start_states = batch_size, num_start_states
+        self.imagined_rows = imagined_rows if imagined_rows is not None else self._rows_to_draw()
+        self.index, self.env_steps = 0, 0
+        seeds = torch.Generator().manual_seed(seed)
+        self._action_rng, self._dream_rng, self._design_rng = (
+            torch.Generator(env.device or "cpu").manual_seed(int(torch.randint(2**62, (), generator=seeds)))
+            for _ in range(3)
+        )
+        self._clock = Stopwatch()
+
+    def __iter__(self) -> Iterator[Event]:
+        while self.index < self.num_designs:
+            kind, design, predicted = self._next_design()
+            yield DesignChosen(self.index, kind, design, predicted)
+            best = torch.full(self.env.batch_size, -torch.inf)
+            # Without the population's weights the individual networks would start each body from the last body's gait.
+            self.individual.start_from(self.population)
+            self.buffers.ind.empty()
+            self._refresh_imagined()
+            for episode in range(self._episodes_of(self.index)):
+                event = self._run_and_learn(kind, design, episode)
+                best = torch.maximum(best, event.evaluation_return.cpu())
+                yield event
+            yield DesignDone(self.index, kind, design, best)
+            self.index += 1
+
+    def _episodes_of(self, index: int) -> int:
+        return self.first_episodes if index < len(self.first_designs) else self.episodes
+
+    # -- the first loop of Algorithm 1: behaviour and networks --------------------------------------------------------
+
+    def _run_and_learn(self, kind: Kind, design: Tensor, episode: int) -> EpisodeDone:
+        self._clock.restart()  # the time between two events is the caller's
+        # Collect experience for the current design with pi_Ind.
+        rows = run_episode(self.env, self.individual.policy, design=design, rng=self._action_rng)
+        self.buffers.ind.extend(rows)
+        self.buffers.pop.extend(rows)
+        self._clock.lap("collect")
+        # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
+        metrics = self._observe(rows)
+        self._refresh_imagined()
+        self._clock.lap("imagine")
+        self.buffers.s0.extend(rows[:1])
+        # Train pi_Ind and Q_Ind, then pi_Pop and Q_Pop, then the ensemble.
+        metrics |= self._train("individual", self.individual, self.individual_parts, self.individual_updates)
+        metrics |= self._train("population", self.population, self.population_parts, self.population_updates)
+        if self.dynamics is not None:
+            parts = batch_parts(self.batch_size)
+            metrics |= self._train("model", self.dynamics, parts, self.model_updates)
+        evaluation = run_episode(self.evaluation_env, self.individual.policy, design=design, deterministic=True)
+        self._clock.lap("evaluate")
+        self.env_steps += len(rows)
+        return EpisodeDone(
+            index=self.index,
+            kind=kind,
+            episode=episode,
+            design=design,
+            training_return=episode_return(rows),
+            evaluation_return=episode_return(evaluation),
+            env_steps=self.env_steps,
+            imagined=len(self.buffers.art),
+            metrics=metrics,
+            seconds=self._clock.read(),
+        )
+
+    def _observe(self, rows: TensorDictBase) -> dict[str, float]:
+        """Scale the ensemble by the new rows, and say how well it foresaw them before it learns from them."""
+        if self.dynamics is None:
+            return {}
+        self.dynamics.observe(rows)
+        return {"model_error": float(self.dynamics.error(rows).mean())}
+
+    def _refresh_imagined(self) -> None:
+        """Empty Replay_Art and fill it with states of Replay_Pop, designs of G, and actions of pi_Pop."""
+        self.buffers.art.empty()
+        if self.dream is None or self.generator is None or len(self.buffers.pop) == 0:
+            return
+        states = self.buffers.pop.sample(self.imagined_rows)
+        rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self._dream_rng)
+        self.buffers.art.extend(rows)
+
+    def _rows_to_draw(self) -> int:
+        """Imagined rows that the updates after one episode will draw, and at least one."""
+        population = self.population_updates * self.population_parts.imagined
+        return max(1, population + self.individual_updates * self.individual_parts.imagined)
+
+    def _train(
+        self, name: str, learner: SACLearner | DynamicsLearner, parts: BatchParts, updates: int
+    ) -> dict[str, float]:
+        """Draw batches by their parts and learn from them; returns the mean of each metric over updates and runs."""
+        own = self.buffers.ind if name == "individual" else self.buffers.pop
+        means: dict[str, float] = {}
+        for done in range(0, updates, UPDATES_PER_SAMPLE):
+            count = min(UPDATES_PER_SAMPLE, updates - done)
+            sources = ((own, parts.own), (self.buffers.pop, parts.other), (self.buffers.art, parts.imagined))
+            batches = sample_mixture(sources, count, imagined=self.buffers.art)
+            for key, value in learner.update(batches).items():
+                means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + float(value) * count / updates
+        self._clock.lap(f"train {name}")
+        return {key: value / self.env.batch_size.numel() for key, value in means.items()}
+
+    # -- the second loop of Algorithm 1: design -----------------------------------------------------------------------
+
+    def _next_design(self) -> tuple[Kind, Tensor, Tensor | None]:
+        """First designs in order, then the optimum of Eq. 5 and a random design in turn."""
+        runs = self.env.batch_size.numel()
+        since = self.index - len(self.first_designs)
+        if since < 0:
+            design = self.first_designs[self.index].expand(runs, -1)
+            return "first", design, self._predict(design)
+        if since % 2 == 0:
+            found = [self.search.maximise(fitness) for fitness in self._fitness()]
+            return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
+        design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self._design_rng)
+        return "random", design, self._predict(design)
+
+    def _fitness(self) -> list[DesignValue]:
+        """Eq. 5 of each run, over the same draw of start states."""
+        states = self.buffers.s0.sample(self.num_start_states)
+        policy, qvalue = self.population.policy, self.population.qvalue
+        runs = self.env.batch_size.numel()
+        if runs == 1:
+            return [DesignValue(policy, qvalue, states[:, 0])]
+        return [DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k]) for k in range(runs)]
+
+    def _predict(self, design: Tensor) -> Tensor | None:
+        if len(self.buffers.s0) == 0:
+            return None
+        return torch.stack([fitness(row.unsqueeze(0))[0] for fitness, row in zip(self._fitness(), design)])
+
+
+@dataclass(frozen=True)
+class BatchParts:
+    """Rows of one batch by where they come from."""
+
+    own: int
+    other: int
+    imagined: int
+
+
+def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -> BatchParts:
+    """Whole rows for shares of a batch.
+
+    Args:
+        batch_size: rows in all.
+        imagined: share from Replay_Art, in [0, 1].
+        other: share from a second real buffer, in [0, 1].
+
+    Raises:
+        ValueError: if a share leaves [0, 1], or the shares need more rows than there are.
+
+    Example:
+        >>> batch_parts(256, imagined=0.2)
+        BatchParts(own=205, other=0, imagined=51)
+    """
+    for name, share in (("imagined", imagined), ("other", other)):
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"the {name} share is {share}, it must lie in [0, 1]")
+    rows = round(batch_size * imagined), round(batch_size * other)
+    if sum(rows) > batch_size:
+        raise ValueError(f"shares {imagined} and {other} of a batch of {batch_size} rows need {sum(rows)}; lower them")
+    return BatchParts(own=batch_size - sum(rows), other=rows[1], imagined=rows[0])
+
+
+def episode_return(rows: TensorDictBase) -> Tensor:
+    """Undiscounted return of an episode ``[T, K]``, per run ``[K]``, on the CPU."""
+    return rows["next", "reward"].sum(0).squeeze(-1).cpu()

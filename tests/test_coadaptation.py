@@ -1,0 +1,214 @@
+"""Algorithm 1: the order of its steps, what fills its buffers, and what bad settings get."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from coim import (
+    Buffers,
+    CoAdaptation,
+    DesignChosen,
+    DesignDone,
+    DynamicsLearner,
+    EpisodeDone,
+    GaussianEnsemble,
+    HopperMorph,
+    KnownDesigns,
+    NoisyDesigns,
+    ParticleSwarm,
+    SACLearner,
+    WorldModelEnv,
+    make_policy,
+    make_qvalue,
+)
+from coim.coadaptation import BatchParts, batch_parts
+
+STEPS = 12
+
+
+def small(num_runs: int = 1, *, imagine: bool = True, sigma: float | None = None, **settings: Any) -> CoAdaptation:
+    """Algorithm 1 on hoppers with tiny networks, few steps and few updates."""
+    torch.manual_seed(0)
+    stacked = num_runs if num_runs > 1 else None
+    env, evaluation_env = (HopperMorph(num_runs=num_runs, episode_steps=STEPS, seed=seed) for seed in (0, 1))
+
+    def learner(seed: int) -> SACLearner:
+        policy = make_policy(env, num_cells=(8,), num_runs=stacked)
+        return SACLearner(policy, make_qvalue(env, num_cells=(8,), num_runs=stacked), num_runs=stacked, seed=seed)
+
+    imagination: dict[str, Any] = {}
+    if imagine:
+        ensemble = GaussianEnsemble.for_env(env, num_cells=(8,), num_runs=stacked)
+        imagination = {
+            "dynamics": DynamicsLearner(ensemble, num_runs=stacked),
+            "dream": WorldModelEnv(ensemble, env, batch_size=env.batch_size),
+            "generator": KnownDesigns() if sigma is None else NoisyDesigns(env.design_spec, sigma=sigma),
+        }
+    defaults: dict[str, Any] = {
+        "first_designs": torch.tensor(HopperMorph.FIRST_DESIGNS[:2]),
+        "num_designs": 5,
+        "first_episodes": 2,
+        "episodes": 1,
+        "individual_updates": 3,
+        "population_updates": 2,
+        "model_updates": 2,
+        "batch_size": 10,
+        "num_start_states": 4,
+    }
+    capacities = {"pop_capacity": 200, "ind_capacity": 50, "s0_capacity": 20, "art_capacity": 50}
+    return CoAdaptation(
+        env,
+        evaluation_env,
+        population=learner(1),
+        individual=learner(2),
+        buffers=Buffers.for_env(env, **capacities, seed=0),
+        search=ParticleSwarm(env.design_spec, num_particles=5, num_iterations=2, seed=0),
+        **imagination | defaults | settings,
+    )
+
+
+def test_events_follow_the_protocol() -> None:
+    events = list(small())
+    chosen = [event for event in events if isinstance(event, DesignChosen)]
+    episodes = [event for event in events if isinstance(event, EpisodeDone)]
+    done = [event for event in events if isinstance(event, DesignDone)]
+    assert [event.kind for event in chosen] == ["first", "first", "optimised", "random", "optimised"]
+    assert [(event.index, event.episode) for event in episodes] == [
+        (0, 0),
+        (0, 1),
+        (1, 0),
+        (1, 1),
+        (2, 0),
+        (3, 0),
+        (4, 0),
+    ]
+    assert [event.env_steps for event in episodes] == [STEPS * (i + 1) for i in range(7)]
+    for event in done:
+        best = max(float(e.evaluation_return) for e in episodes if e.index == event.index)
+        assert float(event.best_return) == pytest.approx(best)
+    assert chosen[0].predicted is None
+    assert all(event.predicted is not None for event in chosen[1:])
+
+
+def test_first_designs_are_those_given_and_later_ones_lie_in_the_bounds() -> None:
+    algorithm = small()
+    chosen = [event for event in algorithm if isinstance(event, DesignChosen)]
+    assert torch.equal(chosen[1].design[0], torch.tensor(HopperMorph.FIRST_DESIGNS[1]))
+    assert all(algorithm.env.design_spec.is_in(event.design[0]) for event in chosen)
+    assert not torch.equal(chosen[2].design, chosen[4].design)
+
+
+def test_buffers_after_a_run() -> None:
+    algorithm = small()
+    last = [event for event in algorithm if isinstance(event, EpisodeDone)][-1]
+    buffers = algorithm.buffers
+    assert len(buffers.pop) == 7 * STEPS
+    assert len(buffers.s0) == 7
+    assert len(buffers.ind) == STEPS  # emptied when the last design began
+    assert torch.equal(buffers.ind[:]["design"][:, 0], last.design.expand(STEPS, -1))
+    assert len(buffers.art) == 2 * 2  # one row for each imagined row of the population's two batches of 8 + 2
+    # With G the identity every imagined row has a state of Replay_Pop with its own design.
+    seen = torch.cat([buffers.pop[:]["observation"], buffers.pop[:]["design"]], -1)[:, 0]
+    dreamt = torch.cat([buffers.art[:]["observation"], buffers.art[:]["design"]], -1)[:, 0]
+    assert all((row == seen).all(-1).any() for row in dreamt)
+
+
+def test_start_states_are_the_first_rows_of_the_episodes() -> None:
+    algorithm = small(first_episodes=1, num_designs=2)
+    list(algorithm)
+    rows = algorithm.buffers.pop[:]
+    starts = algorithm.buffers.s0[:]
+    assert torch.equal(starts["observation"], rows["observation"][[0, STEPS]])
+
+
+def test_the_individual_starts_each_design_from_the_population() -> None:
+    algorithm = small()
+    for event in algorithm:
+        if isinstance(event, DesignChosen):
+            population = {k: v.clone() for k, v in algorithm.population.loss.state_dict().items()}
+        if isinstance(event, EpisodeDone) and event.episode == 0:
+            individual = algorithm.individual.loss.state_dict()
+            moved = max(float((individual[key] - value).abs().max()) for key, value in population.items())
+            assert 0 < moved < 3.1 * 3e-4  # three Adam steps from there
+
+
+def test_without_imagination_nothing_is_imagined_and_no_model_is_trained() -> None:
+    algorithm = small(imagine=False)
+    episodes = [event for event in algorithm if isinstance(event, EpisodeDone)]
+    assert all(event.imagined == 0 for event in episodes)
+    assert not any("model" in key for event in episodes for key in event.metrics)
+    assert algorithm.population_parts == BatchParts(own=10, other=0, imagined=0)
+
+
+def test_noisy_designs_are_imagined_but_never_stored_as_real() -> None:
+    algorithm = small(sigma=0.1, num_designs=2)
+    list(algorithm)
+    assert {tuple(row) for row in algorithm.buffers.pop[:]["design"][:, 0].tolist()} <= {
+        tuple(torch.tensor(design).tolist()) for design in HopperMorph.FIRST_DESIGNS
+    }
+    assert len(algorithm.buffers.art[:]["design"].unique(dim=0)) == len(algorithm.buffers.art)
+
+
+def test_the_same_seed_gives_the_same_events() -> None:
+    first, second = ([event.evaluation_return for event in small() if isinstance(event, EpisodeDone)] for _ in range(2))
+    assert torch.equal(torch.stack(first), torch.stack(second))
+
+
+def test_the_runs_of_a_fleet_get_bodies_of_their_own() -> None:
+    algorithm = small(3)
+    events = list(algorithm)
+    chosen = [event for event in events if isinstance(event, DesignChosen)]
+    assert chosen[0].design.shape == (3, 4)
+    assert torch.equal(chosen[0].design[0], chosen[0].design[2])
+    for event in chosen[2:]:
+        assert len(event.design.unique(dim=0)) == 3
+    assert events[-1].best_return.shape == (3,)
+    assert algorithm.buffers.pop[:].batch_size == (7 * STEPS, 3)
+
+
+def test_nothing_of_one_run_reaches_another() -> None:
+    """Run 0 ends with the same replay whatever the weights of run 1 are, as long as it finds the same designs."""
+
+    def rows_of_run_0(scale: float) -> torch.Tensor:
+        algorithm = small(2, num_designs=2)
+        with torch.no_grad():
+            for learner in (algorithm.population, algorithm.individual):
+                for parameter in learner.loss.parameters():
+                    parameter[1] *= scale
+        list(algorithm)
+        return algorithm.buffers.pop[:]["observation"][:, 0]
+
+    torch.testing.assert_close(rows_of_run_0(1.0), rows_of_run_0(0.5), rtol=0, atol=1e-4)
+
+
+def test_a_caller_can_stop_at_any_event() -> None:
+    algorithm = small()
+    for event in algorithm:
+        if isinstance(event, EpisodeDone):
+            break
+    assert len(algorithm.buffers.pop) == STEPS
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"num_designs": 0}, "num_designs is 0, it must be at least 1"),
+        ({"individual_updates": -1}, "individual_updates is -1"),
+        ({"imagined_share": 1.2}, r"share is 1.2, it must lie in \[0, 1\]"),
+        ({"individual_mix": 0.7, "individual_imagined_share": 0.6}, "need 13"),
+        ({"first_designs": torch.ones(2, 3)}, r"first_designs has shape \[2, 3\], expected \[I, 4\]"),
+        ({"first_designs": torch.full((1, 4), 3.0)}, "leaves"),
+        ({"dream": None}, "both a dream and a generator"),
+    ],
+)
+def test_bad_settings_get_a_sentence_before_anything_is_computed(settings: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        small(**settings)
+
+
+def test_batch_parts_of_the_paper() -> None:
+    assert batch_parts(256, imagined=0.2) == BatchParts(own=205, other=0, imagined=51)
+    assert batch_parts(256, other=0.1) == BatchParts(own=230, other=26, imagined=0)

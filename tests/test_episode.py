@@ -1,0 +1,66 @@
+"""One episode as rows: the same numbers as TorchRL's rollout, and what becomes of a broken simulation."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from coim import HopperMorph, make_policy, run_episode
+from coim.buffers import ROW_KEYS
+
+
+def test_a_deterministic_episode_equals_a_rollout_with_the_same_policy() -> None:
+    designs = torch.tensor([[1.0, 1.0, 1.0, 1.0], [0.7, 1.3, 0.9, 1.8]])
+    torch.manual_seed(0)
+    ours, theirs = (HopperMorph(num_runs=2, episode_steps=30, seed=3) for _ in range(2))
+    policy = make_policy(ours, num_cells=(16,))
+
+    rows = run_episode(ours, policy, design=designs, deterministic=True)
+
+    start = theirs.reset(TensorDict({"design": designs}, [2]))
+    policy_mode = lambda td: td.set("action", policy.network(td["observation"], td["design"])[0].tanh())  # noqa: E731
+    rollout = theirs.rollout(30, policy_mode, auto_reset=False, tensordict=start).transpose(0, 1)
+    assert set(rows.keys(include_nested=True, leaves_only=True)) == set(ROW_KEYS)
+    for key in ROW_KEYS:
+        torch.testing.assert_close(rows[key], rollout[key], rtol=0, atol=0)
+
+
+def test_only_the_last_row_is_truncated() -> None:
+    rows = run_episode(HopperMorph(num_runs=2, episode_steps=4, seed=0), None)
+    assert rows["next", "truncated"].squeeze(-1).tolist() == [[False] * 2] * 3 + [[True] * 2]
+    assert not rows["next", "terminated"].any()
+
+
+def test_random_actions_fill_the_action_space_and_repeat_with_their_generator() -> None:
+    def actions(seed: int) -> torch.Tensor:
+        env = HopperMorph(num_runs=1, episode_steps=200, seed=0)
+        return run_episode(env, None, rng=torch.Generator().manual_seed(seed))["action"]
+
+    first = actions(1)
+    assert first.min() < -0.9
+    assert first.max() > 0.9
+    assert torch.equal(first, actions(1))
+    assert not torch.equal(first, actions(2))
+
+
+def test_a_broken_row_is_terminated_and_starts_again_while_the_other_goes_on() -> None:
+    class Breaking(HopperMorph):
+        """Throws row 0 beyond physics before its third step."""
+
+        steps = 0
+
+        def advance(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+            if self.steps == 2:
+                self.simulations.qvel[0] = 1e12
+            self.steps += 1
+            return super().advance(action)
+
+    breaking, whole = (body(num_runs=2, episode_steps=6, seed=0) for body in (Breaking, HopperMorph))
+    rows, expected = (run_episode(env, None, rng=torch.Generator().manual_seed(0)) for env in (breaking, whole))
+
+    assert rows["next", "terminated"][:, 0].squeeze(-1).tolist() == [False, False, True, False, False, False]
+    assert all(value.isfinite().all() for value in rows.values(include_nested=True, leaves_only=True))
+    start = rows["observation"][3, 0]
+    torch.testing.assert_close(start, rows["observation"][0, 0], rtol=0, atol=0.02)  # reset noise is U(+-0.005)
+    assert not torch.equal(start, rows["next", "observation"][2, 0])
+    assert torch.equal(rows["next", "observation"][:, 1], expected["next", "observation"][:, 1])

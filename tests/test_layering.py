@@ -1,0 +1,179 @@
+"""The rules of the house, read from the sources: who imports whom, what has one home, what a library does not do.
+
+``violations`` maps one source to the rules that it breaks, so that it can be tried on made-up sources too.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# Import only from a lower rank, or from your own room. The rooms of rank 1 do not know each other; rank 2 is one room.
+RANKS = {"objectives.functional": 0, "envs": 1, "models": 1, "objectives": 1, "designs": 1, "buffers": 1}
+RANKS |= {"learner": 2, "episode": 2, "imagination": 2, "coadaptation": 2}
+RECIPES_ONLY = "recipes/"
+HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
+HOMES |= {name: RECIPES_ONLY for name in ("wandb", "tyro", "matplotlib", "argparse")}
+REFUSED = {"utils", "common", "core", "helpers", "misc", "trainers"}
+DYNAMIC_IMPORTS = {"importlib.import_module", "import_module", "__import__"}
+FUNCTIONAL_MAY_IMPORT = {"torch", "__future__", "typing", "math"}
+
+
+def room_of(module: str) -> str | None:
+    """The ranked part of ``coim`` that a module belongs to; None for ``coim`` itself and for modules without a rank."""
+    name = module.removeprefix("coim.")
+    return next((room for room in RANKS if name == room or name.startswith(room + ".")), None)
+
+
+def imports(tree: ast.AST, module: str, *, is_package: bool) -> Iterator[str]:
+    """Every module that a source imports, at its top or inside of functions, relative names resolved."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = module.split(".")[: (0 if not node.level else -node.level + is_package) or None]
+            base = ".".join([*(parents if node.level else []), *([node.module] if node.module else [])])
+            # `from coim.objectives import functional` imports a module, `from coim.designs import KnownDesigns` a name.
+            yield from (f"{base}.{alias.name}" if base.split(".")[0] == "coim" else base for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in DYNAMIC_IMPORTS:
+            yield from (
+                arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
+            )
+
+
+def violations(source: str, module: str, *, is_package: bool = False) -> list[str]:
+    """What a source of ``coim`` does against the rules, one sentence each."""
+    tree = ast.parse(source)
+    names = list(imports(tree, module, is_package=is_package))
+    found = []
+    room = room_of(module)
+    if module != "coim" and room is None:
+        found.append(f"{module} has no rank: give it one in RANKS")
+    for name in names:
+        top, other = name.split(".")[0], room_of(name)
+        if top == "coim" and module != "coim" and room is not None:
+            if other is None:
+                found.append(f"{module} imports {name}, the front door: import from the module that defines it")
+            elif other != room and RANKS[other] >= RANKS[room] and RANKS[room] < 2:
+                found.append(f"{module} (rank {RANKS[room]}) imports {name} (rank {RANKS[other]})")
+        if HOMES.get(top, room) != room:
+            found.append(f"{module} imports {top}, whose home is {HOMES[top]}")
+        if module == "coim.objectives.functional" and top not in FUNCTIONAL_MAY_IMPORT:
+            found.append(f"{module} imports {top}, it may import torch only")
+    prints = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"]
+    return found + [f"{module} prints in line {node.lineno}" for node in prints]
+
+
+def refused_names(paths: list[Path]) -> list[str]:
+    """Folders and modules whose name says nothing about what is in them."""
+    return [str(path) for path in paths if REFUSED & {*path.parent.parts, path.stem}]
+
+
+def library() -> list[tuple[Path, str]]:
+    """Every source of the library with its module name."""
+    sources = sorted((ROOT / "coim").rglob("*.py"))
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in sources]
+    return list(zip(sources, names))
+
+
+@pytest.mark.parametrize(("path", "module"), library(), ids=[name for _, name in library()])
+def test_a_module_keeps_the_rules(path: Path, module: str) -> None:
+    assert violations(path.read_text(), module, is_package=path.name == "__init__.py") == []
+
+
+def test_no_folder_or_module_has_a_name_that_says_nothing() -> None:
+    folders = [ROOT / name for name in ("coim", "recipes", "benchmarks", "tests")]
+    sources = [path.relative_to(ROOT) for folder in folders for path in folder.rglob("*.py")]
+    assert sources
+    assert refused_names(sources) == []
+
+
+def test_importing_the_library_is_silent_and_leaves_no_file(tmp_path: Path) -> None:
+    modules = [module for _, module in library()]
+    script = "\n".join(f"import {module}" for module in modules)
+    script += "\nimport sys; assert not {'matplotlib', 'wandb', 'tyro'} & set(sys.modules)"
+    script += "\nimport logging; assert not logging.root.handlers"
+    result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint"),
+    [
+        (
+            "coim.envs.hopper",
+            "from coim.models.ensemble import GaussianEnsemble",
+            "(rank 1) imports coim.models.ensemble",
+        ),
+        ("coim.buffers", "from coim.designs import KnownDesigns", "(rank 1) imports coim.designs"),
+        ("coim.models.policy", "from coim.learner import Learner", "(rank 1) imports coim.learner"),
+        ("coim.objectives.functional", "import coim.objectives.sac", "(rank 0) imports coim.objectives.sac"),
+        ("coim.objectives.functional", "from . import sac", "(rank 0) imports coim.objectives.sac"),
+        ("coim.objectives.sac", "from ..models import policy", "(rank 1) imports coim.models.policy"),
+        ("coim.designs", "from .buffers import Buffers", "(rank 1) imports coim.buffers"),
+        ("coim.designs", "def late():\n    import coim.buffers", "(rank 1) imports coim.buffers"),
+        ("coim.designs", "import importlib\nimportlib.import_module('coim.buffers')", "(rank 1) imports coim.buffers"),
+        ("coim.learner", "from coim import make_policy", "the front door"),
+        ("coim.models.policy", "import mujoco", "imports mujoco, whose home is envs"),
+        ("coim.learner", "from gymnasium import Env", "imports gymnasium, whose home is envs"),
+        ("coim.buffers", "import pyswarms.single as s", "imports pyswarms, whose home is designs"),
+        ("coim.envs.hopper", "import pyswarms", "imports pyswarms, whose home is designs"),
+        ("coim.coadaptation", "import wandb", "imports wandb, whose home is recipes/"),
+        ("coim.coadaptation", "import tyro", "imports tyro, whose home is recipes/"),
+        ("coim.envs.morph", "import matplotlib.pyplot as plt", "imports matplotlib, whose home is recipes/"),
+        ("coim", "from argparse import ArgumentParser", "imports argparse, whose home is recipes/"),
+        ("coim.objectives.functional", "import numpy as np", "it may import torch only"),
+        ("coim.objectives.functional", "from tensordict import TensorDict", "it may import torch only"),
+        ("coim.learner", "def update():\n    print('loss')", "prints in line 2"),
+        ("coim.training", "import torch", "has no rank"),
+    ],
+)
+def test_a_bad_source_is_found(module: str, source: str, complaint: str) -> None:
+    assert any(complaint in found for found in violations(source, module))
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        (
+            "coim.objectives.sac",
+            "from coim.objectives import functional\nfrom coim.objectives.functional import soft_value",
+        ),
+        (
+            "coim.models.policy",
+            "from coim.objectives.functional import soft_value\nfrom coim.models.stacked import StackedMLP",
+        ),
+        ("coim.envs.hopper", "import mujoco, gymnasium\nfrom .morph import MorphEnv"),
+        ("coim.coadaptation", "from coim.learner import Learner\nfrom coim.imagination import imagine"),
+        (
+            "coim.imagination",
+            "from coim.designs import DesignGenerator\nfrom coim.envs.world_model import WorldModelEnv",
+        ),
+        (
+            "coim.objectives.functional",
+            "from __future__ import annotations\nimport math, torch\nfrom typing import Literal",
+        ),
+        ("coim.learner", '"""Say print("x") in a docstring."""\npprint = 1\nself.print()'),
+        ("coim", "from coim.designs import KnownDesigns\nfrom .buffers import Buffers"),
+    ],
+)
+def test_a_good_source_is_let_through(module: str, source: str) -> None:
+    assert violations(source, module, is_package=module == "coim") == []
+
+
+def test_names_that_say_nothing_are_found() -> None:
+    paths = [
+        Path("coim/utils/seeds.py"),
+        Path("coim/helpers.py"),
+        Path("recipes/common/plot.py"),
+        Path("coim/designs.py"),
+    ]
+    assert refused_names(paths) == [str(path) for path in paths[:3]]

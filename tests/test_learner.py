@@ -1,0 +1,143 @@
+"""Learners: what an update is, what `start_from` copies, and that runs do not meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import pytest
+import torch
+from conftest import ToyEnv
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from coim import CoImSACLoss, DynamicsLearner, GaussianEnsemble, SACLearner, make_policy, make_qvalue, select_run
+
+Rows = Callable[..., TensorDict]
+
+
+def sac_learner(num_runs: int | None = None, *, seed: int = 0, **kwargs: float) -> SACLearner:
+    torch.manual_seed(seed)
+    env = ToyEnv()
+    policy = make_policy(env, num_cells=(16, 16), num_runs=num_runs).double()
+    qvalue = make_qvalue(env, num_cells=(16, 16), num_runs=num_runs).double()
+    return SACLearner(policy, qvalue, num_runs=num_runs, seed=seed, **kwargs)
+
+
+def give_noise(learner: SACLearner, noise: list[torch.Tensor]) -> None:
+    """Let a learner draw this noise instead of its own."""
+    drawn = iter(noise)
+    learner._noise = lambda action: next(drawn)  # type: ignore[method-assign]
+
+
+def weights(learner: SACLearner) -> dict[str, torch.Tensor]:
+    return {key: value.clone() for key, value in learner.loss.state_dict().items()}
+
+
+@pytest.mark.parametrize("mix", ["batch", "sum"])
+def test_updates_equal_the_loss_adam_and_soft_update(make_rows: Rows, mix: str) -> None:
+    learner = sac_learner(mix=mix)
+    policy, qvalue = deepcopy(learner.policy), deepcopy(learner.qvalue)
+    loss = CoImSACLoss(policy, qvalue, mix=mix)
+    targets, optimiser = SoftUpdate(loss, tau=0.005), torch.optim.Adam(loss.parameters(), lr=3e-4)
+    batches = make_rows(20, 32)
+    batches["imagined"] = torch.zeros(20, 32, 1, dtype=torch.bool)
+    batches["imagined"][:, 26:] = True
+
+    learner.update(batches)
+
+    rng = torch.Generator().manual_seed(0)
+    noise = [torch.randn(20, 32, 2, generator=rng, dtype=torch.float64) for _ in range(2)]
+    for i, batch in enumerate(batches):
+        batch["noise"], batch["next", "noise"] = noise[0][i], noise[1][i]
+        losses = loss(batch)
+        optimiser.zero_grad()
+        (losses["loss_actor"] + losses["loss_qvalue"]).backward()
+        optimiser.step()
+        targets.step()
+    for key, value in loss.state_dict().items():
+        torch.testing.assert_close(learner.loss.state_dict()[key], value, rtol=0, atol=1e-9)
+
+
+def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(make_rows: Rows) -> None:
+    fleet = sac_learner(3)
+    alone = [
+        SACLearner(select_run(fleet.policy, k), select_run(fleet.qvalue, k), seed=0) for k in range(3)
+    ]  # fmt: skip
+    batches = make_rows(20, 16, 3)
+    noise = [torch.randn(20, 16, 3, 2, dtype=torch.float64) for _ in range(2)]
+    give_noise(fleet, noise)
+    fleet.update(batches)
+    for k, learner in enumerate(alone):
+        give_noise(learner, [part[:, :, k] for part in noise])
+        learner.update(batches[:, :, k])
+        for network, own in ((fleet.policy, learner.policy), (fleet.qvalue, learner.qvalue)):
+            for actual, expected in zip(select_run(network, k).parameters(), own.parameters(), strict=True):
+                torch.testing.assert_close(actual, expected, rtol=0, atol=1e-9)
+
+
+def test_the_input_is_left_untouched(make_rows: Rows) -> None:
+    batches = make_rows(2, 8)
+    before = batches.clone()
+    sac_learner().update(batches)
+    assert set(batches.keys(True, True)) == set(before.keys(True, True))
+    assert (batches == before).all()
+
+
+def test_start_from_copies_weights_and_targets_and_forgets_the_moments(make_rows: Rows) -> None:
+    population, individual = sac_learner(seed=1), sac_learner(seed=2)
+    for learner in (population, individual):
+        learner.update(make_rows(3, 8))
+    individual.start_from(population)
+    expected = weights(population)
+    for key, value in weights(individual).items():
+        assert torch.equal(value, expected[key]), key
+
+    # The first step of a fresh Adam moves every weight that has a gradient by the learning rate, whatever came before.
+    before = [p.clone() for p in individual.policy.parameters()]
+    individual.update(make_rows(1, 8))
+    moved = torch.cat([(p - b).abs().flatten() for p, b in zip(individual.policy.parameters(), before)])
+    torch.testing.assert_close(moved[moved > 0].median(), torch.tensor(3e-4, dtype=torch.float64), rtol=1e-3, atol=0)
+    for key, value in weights(population).items():
+        assert torch.equal(value, expected[key]), key
+
+
+def test_the_policy_that_acts_is_the_one_that_learns(make_rows: Rows) -> None:
+    learner = sac_learner()
+    observation, design = torch.ones(1, 3, dtype=torch.float64), torch.ones(1, 2, dtype=torch.float64)
+    before = learner.policy.network(observation, design)[0].clone()
+    learner.update(make_rows(2, 8))
+    assert not torch.equal(learner.policy.network(observation, design)[0], before)
+
+
+def test_the_ensemble_learns_and_its_error_falls(make_rows: Rows) -> None:
+    torch.manual_seed(0)
+    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_members=2, num_cells=(32, 32)).double()
+    learner = DynamicsLearner(ensemble, lr=3e-3)
+    rows = make_rows(500, 1)
+    learner.observe(rows)
+    before = learner.error(rows)
+    batches = rows[torch.randint(500, (300, 64), generator=torch.Generator().manual_seed(0))]
+    first, last = (float(learner.update(part)["loss_dynamics"]) for part in (batches[:150], batches[150:]))
+    assert before.shape == (1,)
+    assert last < first
+    assert float(learner.error(rows)) < 0.2 * float(before)
+
+
+def test_predicting_no_change_scores_one() -> None:
+    class Still:
+        """Says that the next observation is this one."""
+
+        def moments(self, observation: torch.Tensor, action: torch.Tensor, design: torch.Tensor) -> tuple:
+            return observation.unsqueeze(-2), None
+
+        def wrapped(self, x: torch.Tensor) -> torch.Tensor:
+            return x
+
+    learner = DynamicsLearner.__new__(DynamicsLearner)
+    learner.ensemble = Still()  # type: ignore[assignment]
+    observation = torch.zeros(1000, 1, 3)
+    following = torch.randn(1000, 1, 3, generator=torch.Generator().manual_seed(0))
+    rows = TensorDict({"observation": observation, "action": observation, "design": observation}, [1000, 1])
+    rows["next"] = TensorDict({"observation": following}, [1000, 1])
+    torch.testing.assert_close(learner.error(rows), torch.ones(1), rtol=0, atol=0.01)
