@@ -1,0 +1,227 @@
+"""From settings to a finished run: build the parts, follow Algorithm 1, write what happens."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torchrl.record.loggers.wandb import WandbLogger
+
+from coim import (
+    Buffers,
+    CoAdaptation,
+    DynamicsLearner,
+    EpisodeDone,
+    Event,
+    GaussianEnsemble,
+    KnownDesigns,
+    MorphEnv,
+    NoisyDesigns,
+    ParticleSwarm,
+    RandomDesigns,
+    SACLearner,
+    WorldModelEnv,
+    make_policy,
+    make_qvalue,
+)
+from coim.designs import DesignGenerator
+from recipes.pictures import draw_run
+from recipes.progress import Progress
+from recipes.results import Results, default_folder, describe
+from recipes.settings import Settings, available_cores, episodes_of, parse
+
+
+def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
+    """Command line of one environment's recipe."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it reports every storage that it allocates
+    settings = parse(f"python -m recipes.{name}", f"Co-adapt {body.__name__}: body and controller together.", arguments)
+    try:
+        run(body, name, settings)
+    except (ValueError, FileExistsError, PermissionError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
+    """Train, and leave a folder with the settings, the numbers and a picture.
+
+    Args:
+        body: the environment.
+        name: of the environment, the first part of the folder's name.
+        settings: everything else.
+
+    Returns:
+        The folder.
+    """
+    threads = settings.threads or available_cores()
+    torch.set_num_threads(threads)
+    algorithm = build(body, settings, threads=threads)
+    folder = settings.out or default_folder(name, settings)
+    results = Results(folder, name, settings, algorithm.env.design_spec.shape[0])
+    progress = Progress(
+        num_designs=settings.num_designs,
+        total_episodes=sum(episodes_of(settings, index) for index in range(settings.num_designs)),
+        updates=settings.individual_updates + settings.population_updates + settings.model_updates,
+        quiet=settings.quiet,
+    )
+    logger = open_wandb(folder, name, settings)
+    if not settings.quiet:
+        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {threads} threads -> {folder}")
+    started = time.perf_counter()
+    for event in algorithm:
+        results.write(event, time.perf_counter() - started)
+        progress.show(event)
+        if logger is not None:
+            log(logger, event, num_runs=settings.num_runs)
+    progress.end()
+    picture = draw_run(folder, body)
+    if not settings.quiet:
+        print(results.table())
+        print(f"picture: {picture}")
+    return folder
+
+
+def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1) -> CoAdaptation:
+    """Make the parts of Algorithm 1 and put them together."""
+    device = checked_device(settings.device)
+    # Streams of one seed that have nothing in common, nor with those of the next seed.
+    seeds = iter(np.random.SeedSequence(settings.seed).generate_state(8).tolist())
+    torch.manual_seed(next(seeds))  # initial weights
+
+    def bodies() -> MorphEnv:
+        return body(
+            num_runs=settings.num_runs,
+            task=settings.task,
+            episode_steps=settings.episode_steps,
+            seed=next(seeds),
+            num_threads=threads,
+            device=device,
+        )
+
+    env, evaluation_env = bodies(), bodies()
+    stacked = settings.num_runs if settings.num_runs > 1 else None  # a single run needs no run axis in its networks
+
+    def learner() -> SACLearner:
+        return SACLearner(
+            make_policy(env, num_cells=settings.num_cells, num_runs=stacked).to(device),
+            make_qvalue(env, num_critics=settings.num_critics, num_cells=settings.num_cells, num_runs=stacked).to(
+                device
+            ),
+            alpha=settings.alpha,
+            gamma=settings.gamma,
+            tau=settings.tau,
+            lr=settings.lr,
+            mix=settings.mix,
+            num_runs=stacked,
+            seed=next(seeds),
+        )
+
+    population, individual = learner(), learner()
+    generator = make_generator(env, settings)
+    dynamics, dream = None, None
+    if generator is not None:
+        ensemble = GaussianEnsemble.for_env(
+            env,
+            num_members=settings.num_members,
+            num_cells=settings.model_cells,
+            predict=settings.predict,
+            num_runs=stacked,
+        ).to(device)
+        dynamics = DynamicsLearner(ensemble, lr=settings.model_lr, weight_decay=settings.weight_decay, num_runs=stacked)
+        dream = WorldModelEnv(ensemble, env, batch_size=env.batch_size)
+    return CoAdaptation(
+        env,
+        evaluation_env,
+        population=population,
+        individual=individual,
+        buffers=make_buffers(env, settings, seed=next(seeds)),
+        search=ParticleSwarm(
+            env.design_spec,
+            num_particles=settings.num_particles,
+            num_iterations=settings.num_iterations,
+            seed=next(seeds),
+        ),
+        first_designs=torch.tensor(body.FIRST_DESIGNS, device=device),
+        dynamics=dynamics,
+        dream=dream,
+        generator=generator,
+        num_designs=settings.num_designs,
+        first_episodes=settings.first_episodes,
+        episodes=settings.episodes,
+        individual_updates=settings.individual_updates,
+        population_updates=settings.population_updates,
+        model_updates=settings.model_updates,
+        batch_size=settings.batch_size,
+        imagined_share=settings.imagined_share,
+        individual_mix=settings.individual_mix,
+        individual_imagined_share=settings.individual_imagined_share,
+        num_start_states=settings.num_start_states,
+        seed=next(seeds),
+    )
+
+
+def make_generator(env: MorphEnv, settings: Settings) -> DesignGenerator | None:
+    """G by its name on the command line."""
+    if settings.designs == "none":
+        return None
+    if settings.designs == "noisy":
+        return NoisyDesigns(env.design_spec, sigma=settings.sigma)
+    return KnownDesigns() if settings.designs == "known" else RandomDesigns(env.design_spec)
+
+
+def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
+    """Four buffers that can hold everything this run will ever put into them."""
+    episodes = [episodes_of(settings, index) for index in range(settings.num_designs)]
+    imagined = settings.population_updates * settings.imagined_share
+    imagined += settings.individual_updates * settings.individual_imagined_share
+    return Buffers.for_env(
+        env,
+        pop_capacity=sum(episodes) * settings.episode_steps,
+        ind_capacity=max(episodes) * settings.episode_steps,
+        s0_capacity=sum(episodes),
+        art_capacity=round(imagined * settings.batch_size) + settings.batch_size,
+        seed=seed,
+        device=checked_device(settings.device),
+    )
+
+
+def checked_device(name: str) -> torch.device:
+    """The device, or a sentence that says why it cannot be used."""
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(
+            f"device {name!r} cannot be used here ({str(error).splitlines()[0]}); try --device cpu"
+        ) from None
+    return device
+
+
+def open_wandb(folder: Path, environment: str, settings: Settings) -> WandbLogger | None:
+    """W&B when asked for; offline needs no account and writes below the run's folder."""
+    if settings.wandb == "off":
+        return None
+    return WandbLogger(
+        exp_name=folder.name,
+        save_dir=str(folder),
+        offline=settings.wandb == "offline",
+        project=f"coim-{environment}",
+        config=describe(environment, settings),
+    )
+
+
+def log(logger: WandbLogger, event: Event, *, num_runs: int) -> None:
+    """The numbers of the CSV files, one series for each run, over training steps."""
+    if not isinstance(event, EpisodeDone):
+        return
+    scalars = dict(event.metrics) | {f"seconds/{part}": value for part, value in event.seconds.items()}
+    for run in range(num_runs):
+        scalars[f"run {run}/return"] = float(event.evaluation_return[run])
+        scalars[f"run {run}/training return"] = float(event.training_return[run])
+        scalars |= {f"run {run}/xi_{i + 1}": float(xi) for i, xi in enumerate(event.design[run])}
+    for name, value in scalars.items():
+        logger.log_scalar(name, value, step=event.env_steps)

@@ -1,0 +1,149 @@
+"""Every number of a run, typed, with the paper's values as defaults."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Co-adapt a body and its controller (Algorithm 1). Defaults are the paper's protocol (Sec. 6.1)."""
+
+    # -- what is asked ------------------------------------------------------------------------------------------------
+    preset: Literal["paper", "quick"] = "paper"
+    """paper: Sec. 6.1. quick: the same body and networks with fewer designs, episodes and updates, for a first look."""
+    task: Literal["forward", "backward"] = "forward"
+    """Which way the speed in the reward counts (Fig. 1, first and second row)."""
+    designs: Literal["known", "noisy", "random", "none"] = "known"
+    """G, the designs that are imagined: as stored, with noise, uniform, or none (the model-free baseline)."""
+    sigma: float = 0.1
+    """Standard deviation of the noisy designs, in scale factors (Sec. 6.4)."""
+    seed: int = 0
+    """Seeds everything; the same seed on the same machine gives the same numbers."""
+    num_runs: int = 1
+    """Independent runs that advance in lock-step in this process (the run axis)."""
+
+    # -- the protocol -------------------------------------------------------------------------------------------------
+    num_designs: int = 55
+    """M, bodies tried: five first designs, then optimised and random ones in turn."""
+    first_episodes: int = 300
+    """Episodes on each of the first designs."""
+    episodes: int = 100
+    """Episodes on each later design."""
+    episode_steps: int = 1000
+    """Steps of an episode; falling does not end it."""
+    individual_updates: int = 1000
+    """Updates of the individual networks after each episode."""
+    population_updates: int = 250
+    """Updates of the population networks after each episode."""
+    model_updates: int = 250
+    """Updates of the dynamics ensemble after each episode."""
+
+    # -- soft actor-critic --------------------------------------------------------------------------------------------
+    batch_size: int = 256
+    """Rows in each batch."""
+    num_cells: tuple[int, ...] = (200, 200, 200)
+    """Hidden units of the policy and of each critic."""
+    num_critics: int = 2
+    """Critics; the smallest value counts."""
+    alpha: float = 0.01
+    """Entropy temperature, fixed."""
+    gamma: float = 0.99
+    """Discount."""
+    tau: float = 0.005
+    """Share of a critic that moves into its target after each update."""
+    lr: float = 3e-4
+    """Adam's learning rate of policy and critics."""
+    individual_mix: float = 0.0
+    """Share of an individual batch drawn from the population's replay (the predecessor's code has 0.1)."""
+
+    # -- imagination --------------------------------------------------------------------------------------------------
+    imagined_share: float = 0.2
+    """Share of a population batch that is imagined (Sec. 5)."""
+    individual_imagined_share: float = 0.0
+    """Share of an individual batch that is imagined (0 as in Sec. 5; Algorithm 1 cites Eq. 7-8 for it too)."""
+    mix: Literal["batch", "sum"] = "batch"
+    """batch: one mean over real and imagined rows (Sec. 5). sum: the two expectations of Eq. 7-8 as printed."""
+    num_members: int = 3
+    """Networks in the dynamics ensemble."""
+    model_cells: tuple[int, ...] = (500, 500, 500)
+    """Hidden units of each of them."""
+    model_lr: float = 3e-4
+    """Adam's learning rate of the ensemble."""
+    weight_decay: float = 1e-5
+    """L2 penalty of the ensemble."""
+    predict: Literal["delta", "next"] = "delta"
+    """What the ensemble's Gaussian is over: the change of the observation, or the next one (Eq. 6 as printed)."""
+
+    # -- design search ------------------------------------------------------------------------------------------------
+    num_particles: int = 700
+    """Particles of the swarm that maximises Eq. 5."""
+    num_iterations: int = 250
+    """Iterations of the swarm."""
+    num_start_states: int = 36
+    """Start states that Eq. 5 averages over."""
+
+    # -- this machine -------------------------------------------------------------------------------------------------
+    device: str = "cpu"
+    """Where the networks live: cpu, cuda, cuda:1, ..."""
+    threads: int = 0
+    """Threads of torch and of the simulation; 0 takes one for each core that this process may use."""
+    out: Path | None = None
+    """Folder for the results; by default runs/ENVIRONMENT-DATE-NAME."""
+    name: str = "run"
+    """Last part of the default folder's name."""
+    wandb: Literal["off", "offline", "online"] = "off"
+    """Send the numbers of the CSV files to Weights & Biases as well."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+QUICK = Settings(
+    preset="quick",
+    num_designs=8,
+    first_episodes=3,
+    episodes=3,
+    individual_updates=300,
+    population_updates=100,
+    model_updates=50,
+    num_particles=100,
+    num_iterations=30,
+    name="quick",
+)
+
+PRESETS = {"paper": Settings(), "quick": QUICK}
+
+
+def parse(program: str, description: str, arguments: Sequence[str] | None = None) -> Settings:
+    """Read the command line; ``--preset`` only moves the defaults of everything else.
+
+    Args:
+        program: shown in the usage line.
+        description: shown in the help.
+        arguments: instead of ``sys.argv[1:]``.
+
+    Raises:
+        SystemExit: on an unknown option or value, with a sentence on standard error.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default="paper")
+    preset = first.parse_known_args(arguments)[0].preset
+    default = PRESETS.get(preset, PRESETS["paper"])  # an unknown name is refused below, with the names that exist
+    return tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
+
+
+def episodes_of(settings: Settings, index: int, *, num_first: int = 5) -> int:
+    """Training episodes of one design."""
+    return settings.first_episodes if index < num_first else settings.episodes
+
+
+def available_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,130 @@
+"""A recipe as a user meets it: what it writes, what it refuses, and that it repeats."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from coim import HopperMorph
+from recipes.experiment import main
+from recipes.settings import PRESETS, Settings, parse
+
+TINY = ["--num-designs", "7", "--first-episodes", "1", "--episodes", "1", "--episode-steps", "6", "--num-cells", "8"]
+TINY += ["--individual-updates", "2", "--population-updates", "2", "--model-updates", "2", "--model-cells", "8"]
+TINY += ["--batch-size", "10", "--num-particles", "4", "--num-iterations", "2", "--num-start-states", "3"]
+
+
+def run(folder: Path, *options: str) -> None:
+    main(HopperMorph, "hopper", [*TINY, "--out", str(folder), *options])
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_leaves_its_settings_its_numbers_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run(tmp_path / "run")
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    evaluations, designs = read(tmp_path / "run" / "evaluations.csv"), read(tmp_path / "run" / "designs.csv")
+    assert config["environment"] == "hopper"
+    assert config["settings"]["num_designs"] == 7
+    assert config["versions"].keys() >= {"coim", "torch", "torchrl", "mujoco", "python"}
+    assert [row["kind"] for row in designs] == ["first"] * 5 + ["optimised", "random"]
+    assert [int(row["design"]) for row in evaluations] == list(range(1, 8))
+    for row, design in zip(evaluations, designs, strict=True):
+        assert [row[f"xi_{i}"] for i in range(1, 5)] == [design[f"xi_{i}"] for i in range(1, 5)]
+        assert row["return"] == design["best_return"]  # one evaluation each
+    assert int(evaluations[-1]["env_steps"]) == 7 * 6
+    assert (tmp_path / "run" / "figures" / "designs.png").stat().st_size > 10_000
+    shown = capsys.readouterr().out
+    assert "design 7/7 random  episode 1" in shown
+    assert shown.count("\n") >= 7 + 8
+
+
+def test_the_same_seed_repeats_and_another_does_not(tmp_path: Path) -> None:
+    for name, seed in (("a", "0"), ("b", "0"), ("c", "1")):
+        run(tmp_path / name, "--seed", seed, "--quiet")
+    a, b, c = ([row["return"] for row in read(tmp_path / name / "evaluations.csv")] for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_runs_in_lock_step_have_a_row_each(tmp_path: Path) -> None:
+    run(tmp_path / "fleet", "--num-runs", "3", "--designs", "noisy", "--task", "backward", "--quiet")
+    designs = read(tmp_path / "fleet" / "designs.csv")
+    assert [row["run"] for row in designs] == ["0", "1", "2"] * 7
+    assert len({row["xi_1"] for row in designs if row["kind"] == "random"}) == 3
+
+
+def test_the_baseline_imagines_nothing_and_quiet_is_quiet(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run(tmp_path / "run", "--designs", "none", "--quiet")
+    assert {row["model_error"] for row in read(tmp_path / "run" / "evaluations.csv")} == {""}
+    assert capsys.readouterr().out == ""
+
+
+def test_offline_wandb_needs_no_account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(tmp_path / "run", "--wandb", "offline", "--num-designs", "1", "--quiet")
+    assert list((tmp_path / "run").glob("wandb/offline-run-*/*.wandb"))
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--imagined-share", "1.5"], "share is 1.5, it must lie in [0, 1]"),
+        (["--device", "cuda:99"], "device 'cuda:99' cannot be used here"),
+        (["--device", "abacus"], "device 'abacus' cannot be used here"),
+        (["--num-runs", "0"], "num_runs 0"),
+        (["--sigma", "-1", "--designs", "noisy"], "sigma is -1"),
+        (["--mix", "stirred"], "stirred"),
+        (["--no-such-option"], "no-such-option"),
+        (["--preset", "slow"], "slow"),
+    ],
+)
+def test_bad_options_get_a_sentence_and_leave_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture, options: list[str], sentence: str
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(tmp_path / "run", *options)
+    assert stop.value.code not in (0, None)
+    assert sentence in f"{stop.value.code} {capsys.readouterr().err}"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "evaluations.csv").write_text("precious")
+    with pytest.raises(SystemExit) as stop:
+        run(tmp_path)
+    assert "already holds something" in str(stop.value.code)
+    assert [path.name for path in tmp_path.iterdir()] == ["evaluations.csv"]
+    assert (tmp_path / "evaluations.csv").read_text() == "precious"
+
+
+def test_a_preset_moves_defaults_and_options_win_over_it() -> None:
+    quick = parse("prog", "", ["--preset", "quick"])
+    assert quick == PRESETS["quick"]
+    assert parse("prog", "", ["--preset", "quick", "--episodes", "9"]).episodes == 9
+    assert parse("prog", "", []) == Settings()
+
+
+def test_every_setting_has_a_sentence_of_help(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        parse("prog", "", ["--help"])
+    shown = capsys.readouterr().out
+    for name in Settings.__dataclass_fields__:
+        assert "--" + name.replace("_", "-") in shown, name
+    assert "Temperature" in shown or "temperature" in shown
+
+
+def test_the_papers_numbers_are_the_defaults() -> None:
+    paper = Settings()
+    assert (paper.num_designs, paper.first_episodes, paper.episodes, paper.episode_steps) == (55, 300, 100, 1000)
+    assert (paper.individual_updates, paper.population_updates, paper.batch_size) == (1000, 250, 256)
+    assert (paper.gamma, paper.tau, paper.lr, paper.alpha, paper.num_cells) == (0.99, 0.005, 3e-4, 0.01, (200,) * 3)
+    assert (paper.num_members, paper.model_cells, paper.model_lr, paper.weight_decay) == (3, (500,) * 3, 3e-4, 1e-5)
+    assert (paper.num_start_states, paper.imagined_share, paper.sigma) == (36, 0.2, 0.1)
