@@ -1,43 +1,60 @@
-"""Learners: networks, loss, optimiser and target update as one thing that learns from batches.
+"""The model-free learner of Algorithm 1: networks, loss, optimiser and target update as one thing.
 
-`SACLearner` is one of the two model-free learners of Algorithm 1 (population or individual), `DynamicsLearner` the
-Gaussian ensemble. Both take many batches in one call, ``[U, B]`` or ``[U, B, K]``: one optimiser step per leading row.
+`coim.objectives.CoImSACLoss` says what is learnt; `coim.objectives.gradients` computes its gradients faster. All
+weights lie in one flat buffer, all targets in another, so that Adam and the target update are one operation each, and
+the modules' parameters are views of them: whoever holds the policy holds the one that learns.
 
-Shapes: U updates, B batch, K runs, A action.
+Shapes: U updates, B batch, K runs, N critics, A action.
 
 References:
-    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Eq. 6-8, Algorithm 1 and Sec. 6.1.
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Eq. 7-8, Algorithm 1 and Sec. 6.1.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
-from coim.models.ensemble import GaussianEnsemble
-from coim.models.policy import Policy
-from coim.objectives.dynamics import EnsembleNLLLoss
+from coim.models.policy import LOG_SCALE_RANGE, Policy
+from coim.models.qvalue import QValue
+from coim.models.stacked import StackedMLP
+from coim.objectives.functional import mixing_weights
+from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
 from coim.objectives.sac import CoImSACLoss
+
+Precision = Literal["float32", "bfloat16"]
 
 
 class SACLearner:
     """Policy and critics that learn with Eq. 7-8, and with Eq. 3-4 where nothing in the batch is imagined.
 
     Args:
-        policy: ``pi(a | s, xi)``.
-        qvalue: the critics ``Q(s, a, xi)``.
+        policy: ``pi(a | s, xi)``, on its device and in its dtype already.
+        qvalue: the critics ``Q(s, a, xi)``, likewise.
         alpha: entropy temperature.
         gamma: discount.
         tau: share of the critics that moves into their targets after each update.
         lr: Adam's learning rate, the same for policy and critics.
-        mix: how imagined rows enter the losses, see `coim.objectives.sac.CoImSACLoss`.
+        mix: how imagined rows enter the losses, see `coim.objectives.CoImSACLoss`.
         num_runs: K when the networks are stacked along the run axis.
+        precision: ``"bfloat16"`` takes the networks' products in bfloat16; weights, moments, targets and losses stay as
+            they are.
         seed: seeds the learner's own generator, from which every policy noise is drawn.
+
+    Attributes:
+        loss: the `CoImSACLoss` over the same parameters, for those who want its value or its gradients.
+        optimiser: Adam over the flat buffer of all weights.
+
+    Raises:
+        ValueError: if ``precision`` is unknown, a number is out of its range, or ``num_runs`` is not the networks'.
+
+    Note:
+        Moving the modules to another device or dtype afterwards would part them from the flat buffers.
 
     Example:
         >>> import torch
@@ -45,14 +62,14 @@ class SACLearner:
         >>> env = HopperMorph(num_runs=1, seed=0)
         >>> learner = SACLearner(make_policy(env, num_cells=(8,)), make_qvalue(env, num_cells=(8,)))
         >>> rows = env.rollout(6).reshape(3, 2)  # three updates with batches of two rows
-        >>> sorted(learner.update(rows).keys())
-        ['entropy', 'loss_actor', 'loss_qvalue']
+        >>> learner.update(rows)["loss_qvalue"].shape
+        torch.Size([1])
     """
 
     def __init__(
         self,
         policy: Policy,
-        qvalue: TensorDictModuleBase,
+        qvalue: QValue,
         *,
         alpha: float = 0.01,
         gamma: float = 0.99,
@@ -60,25 +77,29 @@ class SACLearner:
         lr: float = 3e-4,
         mix: Literal["batch", "sum"] = "batch",
         num_runs: int | None = None,
+        precision: Precision = "float32",
         seed: int = 0,
     ) -> None:
-        self.policy = policy
-        self.qvalue = qvalue
+        if precision not in ("float32", "bfloat16"):
+            raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
+        if not 0 < tau <= 1:
+            raise ValueError(f"tau={tau} is outside (0, 1]; Sec. 6.1 has 0.005")
+        self.policy, self.qvalue = policy, qvalue
         self.loss = CoImSACLoss(policy, qvalue, alpha=alpha, gamma=gamma, mix=mix, num_runs=num_runs)
-        self.targets = SoftUpdate(self.loss, tau=tau)
-        self._parameters = [p for p in self.loss.parameters() if p.requires_grad]
-        self._lr = lr
+        SoftUpdate(self.loss, tau=tau)  # starts the targets at the critics, and tells TorchRL that they are cared for
+        self.tau, self.lr, self.num_runs = tau, lr, num_runs
+        self._lay_out(policy.network.mlp, qvalue.module.mlp, precision)
         self.optimiser = self._fresh_optimiser()
-        self.rng = torch.Generator(self._parameters[0].device).manual_seed(seed)
-
-    def _fresh_optimiser(self) -> torch.optim.Adam:
-        return torch.optim.Adam(self._parameters, lr=self._lr, fused=True)
+        self.rng = torch.Generator(self._weights.device).manual_seed(seed)
 
     def start_from(self, other: SACLearner) -> None:
         """Take the other learner's weights, targets included, with an optimiser that has seen nothing (Algorithm 1)."""
-        self.loss.load_state_dict(other.loss.state_dict())
+        with torch.no_grad():
+            self._weights.copy_(other._weights)
+            self._targets.copy_(other._targets)
         self.optimiser = self._fresh_optimiser()
 
+    @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:
         """One optimiser step and one target update per batch.
 
@@ -86,70 +107,126 @@ class SACLearner:
             batches: rows in the transition schema, ``[U, B]`` or ``[U, B, K]``; left untouched.
 
         Returns:
-            The mean over the U updates of ``loss_actor``, ``loss_qvalue`` and ``entropy``.
+            ``loss_actor``, ``loss_qvalue`` and ``entropy`` of each run, ``[K]``: means over the U updates.
         """
-        batches = batches.copy()
-        for key in ("noise", ("next", "noise")):
-            batches.set(key, self._noise(batches["action"]))
-        history = []
-        for batch in batches.unbind(0):
-            losses = self.loss(batch)
-            self.optimiser.zero_grad(set_to_none=True)
-            (losses["loss_actor"] + losses["loss_qvalue"]).backward()
+        rows = self._arrange(batches)
+        history: list[Tensor] = []
+        for u in range(len(batches)):
+            if self._read_weights.dtype != self._weights.dtype:
+                self._read_weights.copy_(self._weights)
+                self._read_targets.copy_(self._targets)
+            found = [self._gradients(networks, run, rows, u) for run, networks in enumerate(self._networks)]
+            self._collect(found)
             self.optimiser.step()
-            self.targets.step()
-            history.append(losses.detach())
-        return torch.stack(history).mean(0)
+            self._targets.lerp_(self._weights[-len(self._targets) :], self.tau)
+            history.append(torch.stack([torch.stack([g.loss_actor, g.loss_qvalue, g.entropy]) for g in found], -1))
+        means = torch.stack(history).mean(0).reshape(3, -1)
+        return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
+
+    def _fresh_optimiser(self) -> torch.optim.Adam:
+        return torch.optim.Adam([self._weights], lr=self.lr, fused=True)
+
+    # -- one flat buffer, and views of it ------------------------------------------------------------------------------
+
+    def _lay_out(
+        self, policy: StackedMLP, critics: StackedMLP, precision: Precision, *, stack_runs: bool | None = None
+    ) -> None:
+        """Move all weights into one flat buffer and all targets into another, critics last and in the same order.
+
+        A CPU multiplies the matrices of one network after the other; a GPU takes all runs in one product.
+        """
+        own = [*policy.parameters(), *critics.parameters()]
+        keys = [tuple(name.split(".")) for name, _ in self.qvalue.named_parameters()]
+        targets = [self.loss.target_qvalue_params.get(key) for key in keys]
+        self._weights = nn.Parameter(share_storage(own))
+        self._weights.grad = self._gradient = torch.zeros_like(self._weights.detach())
+        self._targets = share_storage(targets)
+        # Products read these: the weights themselves, or copies in bfloat16 that every update renews.
+        self._read_weights, self._read_targets = self._weights.detach(), self._targets
+        if precision == "bfloat16":
+            self._read_weights = self._read_weights.to(torch.bfloat16)
+            self._read_targets = self._read_targets.to(torch.bfloat16)
+        read, target_views = views(self._read_weights, own), views(self._read_targets, targets)
+        policy_views, critic_views = read[: -len(targets)], read[-len(targets) :]
+        stack_runs = self._weights.device.type != "cpu" if stack_runs is None else stack_runs
+        runs: list[Any] = [()]  # where a network of one run, or of all of them, lies in stacked weights
+        if self.num_runs is not None:
+            runs = [(slice(None),)] if stack_runs else [(run,) for run in range(self.num_runs)]
+        copies = range(critics.num_copies or 1)
+        self._networks = [
+            (
+                _network(policy_views, run),
+                [_network(critic_views, (*run, n)) for n in copies],
+                [_network(target_views, (*run, n)) for n in copies],
+            )
+            for run in runs
+        ]
+
+    def _arrange(self, batches: TensorDictBase) -> Batch:
+        """Bare tensors ``[U, K, B, ...]``, the run axis before the batch, with fresh noise and the rows' weights."""
+        runs = self.num_runs or 1
+        noise, next_noise = (self._noise(batches["action"]) for _ in range(2))
+        imagined = batches.get("imagined", None)
+        if imagined is None:
+            imagined = torch.zeros_like(batches["next", "terminated"])
+
+        def by_run(x: Tensor) -> Tensor:
+            return x.reshape(len(x), -1, runs, x.shape[-1]).transpose(1, 2).contiguous()
+
+        flags = by_run(imagined).squeeze(-1)
+        weight = [mixing_weights(flag.mT, self.loss.mix, dtype=noise.dtype).mT for flag in flags]
+        after = batches["next"]
+        return Batch(
+            observation=by_run(batches["observation"]),
+            design=by_run(batches["design"]),
+            action=by_run(batches["action"]),
+            next_observation=by_run(after["observation"]),
+            reward=by_run(after["reward"]).squeeze(-1),
+            terminated=by_run(after["terminated"]).squeeze(-1),
+            noise=by_run(noise),
+            next_noise=by_run(next_noise),
+            weight=torch.stack(weight),
+        )
 
     def _noise(self, action: Tensor) -> Tensor:
         return torch.randn(action.shape, generator=self.rng, dtype=action.dtype, device=action.device)
 
+    def _gradients(
+        self, networks: tuple[Network, list[Network], list[Network]], run: int, rows: Batch, u: int
+    ) -> SACGradients:
+        """Gradients of one run, or of all of them stacked, in update u."""
+        one = len(self._networks) > 1 or self.num_runs is None
+        batch = Batch(*(x[u, run] if one else x[u] for x in rows))
+        return sac_gradients(
+            *networks, batch, alpha=self.loss.alpha, gamma=self.loss.gamma, log_scale_range=LOG_SCALE_RANGE
+        )
 
-class DynamicsLearner:
-    """The Gaussian ensemble learning Eq. 6 with Adam and weight decay (Sec. 6.1).
+    def _collect(self, found: list[SACGradients]) -> None:
+        """Write gradients where Adam reads them, in the order of the flat buffer: layer, then run, then critic."""
+        parts = [g.policy[i] for i in range(len(found[0].policy)) for g in found]
+        stacked = self.num_runs is not None and len(found) == 1
+        for i in range(len(found[0].critics[0])):
+            if stacked:
+                parts.append(torch.stack([critic[i] for critic in found[0].critics], 1))
+            else:
+                parts.extend(critic[i] for g in found for critic in g.critics)
+        self._gradient.copy_(torch.cat([part.reshape(-1) for part in parts]))
 
-    Args:
-        ensemble: the model; its normalisers are fed by `observe`.
-        lr: learning rate.
-        weight_decay: L2 penalty of Adam, as in the ensembles of PETS that the paper follows.
-        num_runs: K when the ensemble is stacked along the run axis.
-    """
 
-    def __init__(
-        self, ensemble: GaussianEnsemble, *, lr: float = 3e-4, weight_decay: float = 1e-5, num_runs: int | None = None
-    ) -> None:
-        self.ensemble = ensemble
-        self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
-        self._parameters: list[nn.Parameter] = [p for p in self.loss.parameters() if p.requires_grad]
-        self.optimiser = torch.optim.Adam(self._parameters, lr=lr, weight_decay=weight_decay, fused=True)
+def share_storage(tensors: Sequence[Tensor]) -> Tensor:
+    """Move tensors into one flat buffer, in place: each becomes a view of what is returned."""
+    flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
+    for tensor, view in zip(tensors, views(flat, tensors)):
+        tensor.data = view
+    return flat
 
-    def observe(self, rows: TensorDictBase) -> None:
-        """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets."""
-        self.ensemble.update_statistics(rows)
 
-    @torch.no_grad()
-    def error(self, rows: TensorDictBase) -> Tensor:
-        """Squared error of the members' means, in units of the variance of one-step changes in these rows.
+def views(flat: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Consecutive parts of a flat buffer in the shapes of some tensors."""
+    parts = flat[: sum(tensor.numel() for tensor in tensors)].split([tensor.numel() for tensor in tensors])
+    return [part.view(tensor.shape) for part, tensor in zip(parts, tensors)]
 
-        Args:
-            rows: ``[R, K]``, at least two of them.
 
-        Returns:
-            Mean over rows, members and observation entries, ``[K]``; predicting "nothing changes" scores about 1.
-        """
-        observation, following = rows["observation"], rows["next", "observation"]
-        means, _ = self.ensemble.moments(observation, rows["action"], rows["design"])
-        error = self.ensemble.wrapped(means - following.unsqueeze(-2)).square().mean((0, -2))
-        variance = self.ensemble.wrapped(following - observation).var(0)
-        return (error / variance.clamp(min=1e-12)).mean(-1)
-
-    def update(self, batches: TensorDictBase) -> TensorDict:
-        """One optimiser step per batch of ``[U, B]`` or ``[U, B, K]`` rows; returns the mean ``loss_dynamics``."""
-        history = []
-        for batch in batches.unbind(0):
-            losses = self.loss(batch)
-            self.optimiser.zero_grad(set_to_none=True)
-            losses["loss_dynamics"].backward()
-            self.optimiser.step()
-            history.append(losses.detach())
-        return torch.stack(history).mean(0)
+def _network(layers: Sequence[Tensor], index: Any) -> Network:
+    """One network, or one for each run, out of stacked weights and biases."""
+    return Network([weight[index] for weight in layers[0::2]], [bias[index] for bias in layers[1::2]])

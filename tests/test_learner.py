@@ -11,7 +11,7 @@ from conftest import ToyEnv
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from coim import CoImSACLoss, DynamicsLearner, GaussianEnsemble, SACLearner, make_policy, make_qvalue, select_run
+from coim import CoImSACLoss, SACLearner, make_policy, make_qvalue, select_run
 
 Rows = Callable[..., TensorDict]
 
@@ -108,36 +108,3 @@ def test_the_policy_that_acts_is_the_one_that_learns(make_rows: Rows) -> None:
     before = learner.policy.network(observation, design)[0].clone()
     learner.update(make_rows(2, 8))
     assert not torch.equal(learner.policy.network(observation, design)[0], before)
-
-
-def test_the_ensemble_learns_and_its_error_falls(make_rows: Rows) -> None:
-    torch.manual_seed(0)
-    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_members=2, num_cells=(32, 32)).double()
-    learner = DynamicsLearner(ensemble, lr=3e-3)
-    rows = make_rows(500, 1)
-    learner.observe(rows)
-    before = learner.error(rows)
-    batches = rows[torch.randint(500, (300, 64), generator=torch.Generator().manual_seed(0))]
-    first, last = (float(learner.update(part)["loss_dynamics"]) for part in (batches[:150], batches[150:]))
-    assert before.shape == (1,)
-    assert last < first
-    assert float(learner.error(rows)) < 0.2 * float(before)
-
-
-def test_predicting_no_change_scores_one() -> None:
-    class Still:
-        """Says that the next observation is this one."""
-
-        def moments(self, observation: torch.Tensor, action: torch.Tensor, design: torch.Tensor) -> tuple:
-            return observation.unsqueeze(-2), None
-
-        def wrapped(self, x: torch.Tensor) -> torch.Tensor:
-            return x
-
-    learner = DynamicsLearner.__new__(DynamicsLearner)
-    learner.ensemble = Still()  # type: ignore[assignment]
-    observation = torch.zeros(1000, 1, 3)
-    following = torch.randn(1000, 1, 3, generator=torch.Generator().manual_seed(0))
-    rows = TensorDict({"observation": observation, "action": observation, "design": observation}, [1000, 1])
-    rows["next"] = TensorDict({"observation": following}, [1000, 1])
-    torch.testing.assert_close(learner.error(rows), torch.ones(1), rtol=0, atol=0.01)

@@ -21,6 +21,8 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 from torchrl.envs import EnvBase
 
+from coim.angles import wrap_angle
+
 from .normaliser import RunningNormaliser
 from .stacked import StackedMLP
 
@@ -28,11 +30,6 @@ from .stacked import StackedMLP
 # have variance 1, so that a member that knows nothing stays inside; exp(-10) is a noise of 0.7 % of their spread, and
 # keeps a deterministic simulator from driving the density to infinity.
 LOG_VAR_RANGE = (-10.0, 0.5)
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """Bring angles in radians into (-pi, pi]."""
-    return math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
 
 
 class GaussianEnsemble(TensorDictModuleBase):
@@ -246,16 +243,26 @@ class GaussianEnsemble(TensorDictModuleBase):
         return torch.where(self.is_angle, wrap_angle(x), x) if self.angle_indices else x
 
     def _grouped(self, inputs: Tensor, members: Tensor) -> Tensor:
-        """Run each member on its own rows only: ``[*B, (K,) F], [*B, (K)] -> [*B, (K,) 2 S]``.
-
-        Chunks of about 3,000 rows keep the activations in a CPU's cache.
-        """
+        """Run each member on its own rows only: ``[*B, (K,) F], [*B, (K)] -> [*B, (K,) 2 S]``."""
         runs = self.num_runs or 1
         rows = inputs.reshape(-1, runs, inputs.shape[-1])
         groups = members.reshape(-1, runs) + self.num_members * torch.arange(runs, device=members.device)
-        size = max(1, (3_000 if inputs.device.type == "cpu" else 100_000) // runs)
-        out = [self._grouped_chunk(x.flatten(0, 1), g.flatten()) for x, g in zip(rows.split(size), groups.split(size))]
-        return torch.cat(out).reshape(*inputs.shape[:-1], self.network.out_features)
+        if self.network.serves_bare(inputs, groups.numel() // (self.num_members * runs)):
+            out = self._by_group(rows.flatten(0, 1), groups.flatten())
+        else:  # chunks of about 3,000 rows keep the activations in a CPU's cache
+            size = max(1, (3_000 if inputs.device.type == "cpu" else 100_000) // runs)
+            chunks = zip(rows.split(size), groups.split(size))
+            out = torch.cat([self._grouped_chunk(x.flatten(0, 1), g.flatten()) for x, g in chunks])
+        return out.reshape(*inputs.shape[:-1], self.network.out_features)
+
+    def _by_group(self, rows: Tensor, group: Tensor) -> Tensor:
+        """Evaluate group after group of ``[R, F]``, without gradients and without padding."""
+        counts = torch.bincount(group, minlength=self.num_members * (self.num_runs or 1))
+        out = rows.new_empty(len(rows), self.network.out_features)
+        for copy, own in enumerate(group.argsort(stable=True).split(counts.tolist())):
+            if len(own):
+                out[own] = self.network.forward_copy(copy, rows[own])
+        return out
 
     def _grouped_chunk(self, rows: Tensor, group: Tensor) -> Tensor:
         """Sort ``[R, F]`` into equally long, zero-padded groups, evaluate these, and put their rows back in order."""

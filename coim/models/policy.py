@@ -84,6 +84,10 @@ class Policy(ProbabilisticActor):
         """The tensor-level network."""
         return self.module[0].module
 
+    def deterministic_action(self, observation: Tensor, design: Tensor) -> Tensor:
+        """The mode's action ``tanh(loc)``, on bare tensors: ``[*B, (K,) S], [*B, (K,) D] -> [*B, (K,) A]``."""
+        return self.network(observation, design)[0].tanh()
+
     @property
     def num_runs(self) -> int | None:
         """``K``, or None for a single run."""

@@ -66,6 +66,10 @@ class QValue(TensorDictModule):
     def __init__(self, network: QValueNetwork) -> None:
         super().__init__(network, in_keys=["observation", "action", "design"], out_keys=["state_action_value"])
 
+    def values(self, observation: Tensor, action: Tensor, design: Tensor) -> Tensor:
+        """All critics on bare tensors, see :meth:`QValueNetwork.forward`."""
+        return self.module(observation, action, design)
+
     @property
     def num_runs(self) -> int | None:
         """``K``, or None for a single run."""

@@ -5,7 +5,6 @@ import torch
 from tensordict import TensorDict
 
 from coim.models import GaussianEnsemble, select_run
-from coim.models.ensemble import wrap_angle
 from coim.objectives import EnsembleNLLLoss
 
 KEYS = ("observation", "action", "design")
@@ -101,6 +100,20 @@ def test_grouping_gives_what_evaluating_all_members_and_gathering_gives(make_row
     torch.testing.assert_close(sampled, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("num_members", [1, 4])
+@pytest.mark.parametrize("runs", [None, 2])
+def test_sampling_without_gradients_draws_the_same(monkeypatch, make_rows, runs, num_members):
+    rows = make_rows(2_000, 2, dtype=torch.float32)
+    ensemble = ensemble_on(rows, num_runs=runs, num_members=num_members).float()
+    members = torch.randint(max(1, num_members - 1), (2_000, 2))  # the last of four has no rows
+    noise = torch.randn(2_000, 2, 3)
+    expected = ensemble.sample(*inputs(rows), members=members, noise=noise).detach()
+    monkeypatch.setattr(ensemble, "_grouped_chunk", None)
+    with torch.no_grad():
+        sampled = ensemble.sample(*inputs(rows), members=members, noise=noise)
+    torch.testing.assert_close(sampled, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_a_sample_has_the_moments_of_its_member(make_rows):
     rows = make_rows(1)
     ensemble, many = ensemble_on(make_rows(50)), make_rows(1).expand(1, 20_000).reshape(-1)
@@ -161,12 +174,6 @@ def test_a_predicted_angle_is_wrapped(predict):
     mean, _ = ensemble.moments(start, zeros, zeros)
     for angle in (drawn, mean):
         assert angle[..., 0].max() > math.pi > angle[..., 1].abs().max()
-
-
-def test_pi_stays_pi():
-    angles = torch.tensor([math.pi, -math.pi, 0.0, 3.5 * math.pi, -0.5 * math.pi], dtype=torch.float64)
-    expected = torch.tensor([math.pi, math.pi, 0.0, -0.5 * math.pi, -0.5 * math.pi], dtype=torch.float64)
-    torch.testing.assert_close(wrap_angle(angles), expected)
 
 
 def test_an_environment_tells_its_angles(toy_env):

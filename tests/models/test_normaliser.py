@@ -41,3 +41,17 @@ def test_the_standard_deviation_has_a_floor():
     normaliser = RunningNormaliser(2, min_std=torch.tensor([0.5, 0.0]))
     normaliser.update(torch.tensor([[1.0, 1.0], [1.02, 1.02]]))
     torch.testing.assert_close(normaliser.std, torch.tensor([0.5, 0.01], dtype=torch.float64), rtol=1e-4, atol=0)
+
+
+def test_rounding_does_not_count_as_varying():
+    normaliser = RunningNormaliser(1)
+    for num in (1, 3, 7, 100, 1000):
+        normaliser.update(torch.full((num, 1), 0.1, dtype=torch.float64))
+    normaliser.square_sum += 1e-18  # what many merges may leave behind
+    assert normaliser.std.tolist() == [1.0]
+
+
+def test_a_feature_that_never_varied_is_scaled_by_its_floor_if_it_has_one():
+    normaliser = RunningNormaliser(2, min_std=torch.tensor([0.5, 0.0]))
+    normaliser.update(torch.ones(10, 2))
+    assert normaliser.std.tolist() == [0.5, 1.0]

@@ -1,3 +1,5 @@
+from functools import partial
+
 import pytest
 import torch
 from torch import nn
@@ -41,6 +43,44 @@ def test_each_copy_on_rows_of_its_own(runs, copies):
     for g in range(groups):
         index = () if not mlp.stack else tuple(int(i) for i in torch.unravel_index(torch.tensor(g), mlp.stack))
         torch.testing.assert_close(out[g], torch_mlp(mlp, *index)(x[g]), rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("activation", [nn.ReLU, nn.SiLU])
+@pytest.mark.parametrize(("runs", "copies"), STACKS)
+def test_without_gradients_it_computes_the_same_one_copy_after_the_other(monkeypatch, runs, copies, activation):
+    mlp = StackedMLP(5, 4, [70, 60], num_runs=runs, num_copies=copies, activation=activation)
+    x = torch.randn(30, 100, *([] if runs is None else [runs]), 5)  # more rows than one chunk
+    expected = mlp(x).detach()
+    monkeypatch.setattr(mlp, "_product", None)
+    with torch.no_grad():
+        out = mlp(x[..., :2], x[..., 2:])
+    torch.testing.assert_close(out, expected, rtol=1e-5, atol=1e-6)
+    monkeypatch.undo()
+    with torch.no_grad():
+        rounded = mlp.bfloat16()(x.bfloat16())
+    assert rounded.dtype == torch.bfloat16
+    torch.testing.assert_close(rounded.float(), expected, rtol=0.05, atol=0.02)
+
+
+def test_a_function_transform_is_left_to_itself_without_gradients():
+    many = [StackedMLP(5, 2, [7], num_copies=2) for _ in range(3)]
+    x = torch.randn(200, 5)
+    params, buffers = torch.func.stack_module_state(many)
+    call = partial(torch.func.functional_call, many[0])
+    with torch.no_grad():
+        over_weights = torch.vmap(lambda p: call((p, buffers), x))(params)
+        over_rows = torch.vmap(many[0])(x.expand(4, 200, 5))
+        expected = torch.stack([mlp(x) for mlp in many])
+    torch.testing.assert_close(over_weights, expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(over_rows[3], expected[0], rtol=1e-5, atol=1e-6)
+
+
+def test_an_activation_that_no_library_fuses_works_without_gradients():
+    mlp = StackedMLP(5, 2, [7], activation=nn.LeakyReLU)
+    x = torch.randn(200, 5)
+    with torch.no_grad():
+        torch.testing.assert_close(mlp(x), mlp.requires_grad_(False)(x))
+    assert (mlp(x) != 0).all()
 
 
 def test_no_gradient_crosses_runs():

@@ -1,7 +1,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from coim.models import make_policy, make_qvalue
@@ -20,7 +20,7 @@ def designs(num: int) -> torch.Tensor:
     return torch.rand(num, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.5
 
 
-@pytest.mark.parametrize("chunk_size", [1, 3, 28])
+@pytest.mark.parametrize("chunk_size", [None, 1, 3, 28])
 def test_it_is_a_loop_over_designs_and_start_states(parts, chunk_size):
     policy, qvalue, starts = parts
     expected = []
@@ -33,6 +33,37 @@ def test_it_is_a_loop_over_designs_and_start_states(parts, chunk_size):
     ours = DesignValue(policy, qvalue, starts, chunk_size=chunk_size)(designs(10))
     torch.testing.assert_close(ours, torch.stack(expected), rtol=1e-12, atol=1e-13)
     assert not ours.requires_grad
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_bare_networks_give_what_their_modules_give(toy_env, precision):
+    policy, qvalue = make_policy(toy_env), make_qvalue(toy_env)
+    starts = TensorDict({"observation": torch.randn(36, 3)}, [36])
+    candidates = designs(100).float()
+    bare = DesignValue(policy, qvalue, starts, precision=precision)
+    wrapped = DesignValue(TensorDictSequential(policy), TensorDictSequential(qvalue), starts, precision=precision)
+    assert bare._networks_are_bare()
+    assert not wrapped._networks_are_bare()
+    torch.testing.assert_close(bare(candidates), wrapped(candidates), rtol=1e-5, atol=1e-6)
+    gradients = []
+    for fitness in (bare, wrapped):
+        xi = candidates.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(fitness(xi).sum(), xi)
+        gradients.append(gradient)
+    tolerance = 1e-5 if precision == "float32" else 0.1
+    assert (gradients[0] - gradients[1]).norm() <= tolerance * gradients[1].norm()
+
+
+def test_bfloat16_is_close_and_leaves_the_weights_as_they_are(toy_env):
+    torch.manual_seed(0)
+    policy, qvalue = make_policy(toy_env), make_qvalue(toy_env)
+    starts = TensorDict({"observation": torch.randn(36, 3)}, [36])
+    exact = DesignValue(policy, qvalue, starts)(designs(100).float())
+    fast = DesignValue(policy, qvalue, starts, precision="bfloat16")(designs(100).float())
+    assert fast.dtype == torch.float32
+    assert 0 < (fast - exact).abs().max() < 0.02 * exact.abs().max()
+    assert exact[fast.argmax()] > exact.max() - 0.01 * exact.abs().max()  # what it chooses is as good
+    assert all(p.dtype == torch.float32 for p in (*policy.parameters(), *qvalue.parameters()))
 
 
 def test_closed_form():
@@ -110,6 +141,8 @@ def test_bad_input_is_named(parts):
         DesignValue(policy, qvalue, starts.unsqueeze(1))
     with pytest.raises(ValueError, match="chunk_size=0 must be at least 1"):
         DesignValue(policy, qvalue, starts, chunk_size=0)
+    with pytest.raises(ValueError, match="precision='half' is unknown; choose 'float32' or 'bfloat16'"):
+        DesignValue(policy, qvalue, starts, precision="half")
     starts["observation"][0, 0] = torch.inf
     with pytest.raises(ValueError, match=r"NaN or infinite entries in \['observation'\]"):
         DesignValue(policy, qvalue, starts)

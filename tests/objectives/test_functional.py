@@ -32,12 +32,12 @@ def test_a_terminated_row_ignores_even_a_broken_value():
 
 
 def test_the_qvalue_loss_has_the_printed_one_half_and_sums_over_critics():
-    q = double(3.0, 6.0).reshape(1, 2)
-    assert functional.qvalue_loss(q, target=double(2.0)).tolist() == [8.5]  # (1 + 16) / 2
+    q = double(3.0, 6.0, 2.0).reshape(1, 3)
+    assert functional.qvalue_loss(q, target=double(2.0)).tolist() == [8.5]  # (1 + 16 + 0) / 2
 
 
 def test_the_policy_loss_is_the_cost_of_certainty_minus_the_lower_critic():
-    q = double(3.0, 6.0).reshape(1, 2)
+    q = double(6.0, 3.0).reshape(1, 2)
     assert functional.policy_loss(q, log_prob=double(4.0), alpha=0.25).tolist() == [-2.0]
 
 

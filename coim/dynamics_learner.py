@@ -1,0 +1,162 @@
+"""The dynamics learner of Algorithm 1: ensemble, loss and optimiser as one thing.
+
+`coim.objectives.EnsembleNLLLoss` says what is learnt; `coim.objectives.dynamics_gradients` computes its gradients
+faster. All weights lie in one flat buffer, of which the ensemble's parameters are views.
+
+Shapes: U updates, B batch, K runs, E members, F input features, S state, R rows.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Eq. 6, Algorithm 1 and Sec. 6.1.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from coim.learner import Precision, share_storage, views
+from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
+from coim.objectives.dynamics import EnsembleNLLLoss
+from coim.objectives.dynamics_gradients import dynamics_gradients
+from coim.objectives.gradients import Network
+from coim.objectives.runs import check_batch
+
+
+class DynamicsLearner:
+    """The Gaussian ensemble learning Eq. 6 with Adam and weight decay (Sec. 6.1).
+
+    Args:
+        ensemble: the model, on its device and in its dtype already; its normalisers are fed by `observe`.
+        lr: learning rate.
+        weight_decay: L2 penalty of Adam, as in the ensembles of PETS that the paper follows.
+        num_runs: K when the ensemble is stacked along the run axis.
+        precision: ``"bfloat16"`` takes the network's products in bfloat16; weights, moments, targets and losses stay as
+            they are.
+
+    Attributes:
+        loss: the `EnsembleNLLLoss` over the same parameters, for those who want its value or its gradients.
+        optimiser: Adam over the flat buffer of all weights.
+
+    Raises:
+        ValueError: if ``precision`` is unknown or ``num_runs`` is not the ensemble's.
+
+    Note:
+        Moving the ensemble to another device or dtype afterwards parts it from the flat buffer; so does a deep copy of
+        the learner.
+
+    Example:
+        >>> from coim import HopperMorph
+        >>> env = HopperMorph(num_runs=1, seed=0)
+        >>> learner = DynamicsLearner(GaussianEnsemble.for_env(env, num_cells=(8,)))
+        >>> rows = env.rollout(6)
+        >>> learner.observe(rows)
+        >>> learner.update(rows.reshape(3, 2))["loss_dynamics"].shape  # three updates with batches of two rows
+        torch.Size([1])
+    """
+
+    def __init__(
+        self,
+        ensemble: GaussianEnsemble,
+        *,
+        lr: float = 3e-4,
+        weight_decay: float = 1e-5,
+        num_runs: int | None = None,
+        precision: Precision = "float32",
+    ) -> None:
+        if precision not in ("float32", "bfloat16"):
+            raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
+        self.ensemble, self.num_runs = ensemble, num_runs
+        self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
+        self._lay_out(list(ensemble.network.parameters()), precision)
+        self.optimiser = torch.optim.Adam([self._weights], lr=lr, weight_decay=weight_decay, fused=True)
+
+    def observe(self, rows: TensorDictBase) -> None:
+        """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets."""
+        self.ensemble.update_statistics(rows)
+
+    @torch.no_grad()
+    def error(self, rows: TensorDictBase) -> Tensor:
+        """Squared error of the members' means, in units of the variance of one-step changes in these rows.
+
+        Args:
+            rows: ``[R, K]``, at least two of them.
+
+        Returns:
+            Mean over rows, members and observation entries, ``[K]``; predicting "nothing changes" scores about 1.
+        """
+        observation, following = rows["observation"], rows["next", "observation"]
+        means, _ = self.ensemble.moments(observation, rows["action"], rows["design"])
+        error = self.ensemble.wrapped(means - following.unsqueeze(-2)).square().mean((0, -2))
+        variance = self.ensemble.wrapped(following - observation).var(0, correction=0)
+        return (error / variance.clamp(min=1e-12)).mean(-1)
+
+    @torch.no_grad()
+    def update(self, batches: TensorDictBase) -> TensorDict:
+        """One optimiser step per batch.
+
+        Args:
+            batches: rows in the transition schema, ``[U, B]`` or ``[U, B, K]``; left untouched.
+
+        Returns:
+            ``loss_dynamics`` of each run, the sum over its members, ``[K]``: means over the U updates.
+
+        Raises:
+            ValueError: if there are no rows or the run axis is missing.
+            RuntimeError: if the ensemble's weights no longer lie in the flat buffer.
+        """
+        check_batch(batches.batch_size, self.num_runs)
+        if next(self.ensemble.network.parameters()).data_ptr() != self._weights.data_ptr():
+            raise RuntimeError("the ensemble was moved after its learner was made; make the learner last")
+        inputs, targets = self._arrange(batches)
+        total = torch.zeros(self.num_runs or 1, dtype=targets.dtype, device=targets.device)
+        for x, target in zip(inputs, targets):
+            if self._read_weights.dtype != self._weights.dtype:
+                self._read_weights.copy_(self._weights)
+            total += self._write_gradients(x, target)
+            self.optimiser.step()
+        total /= len(inputs)
+        return TensorDict({"loss_dynamics": total}, total.shape)
+
+    def _lay_out(self, parameters: list[nn.Parameter], precision: Precision) -> None:
+        """Move all weights into one flat buffer, and cut it and that of the gradients into networks."""
+        self._weights = nn.Parameter(share_storage(parameters))
+        self._weights.grad = torch.zeros_like(self._weights)
+        # Products read these: the weights themselves, or a copy in bfloat16 that every update renews.
+        self._read_weights = self._weights.detach()
+        if precision == "bfloat16":
+            self._read_weights = self._read_weights.to(torch.bfloat16)
+        stack = len(self.ensemble.network.stack)
+        read, gradients = (
+            [part.flatten(0, stack - 1) for part in views(flat, parameters)]
+            for flat in (self._read_weights, self._weights.grad)
+        )
+        # A CPU multiplies the matrices of one member after the other; a GPU wants all in one product.
+        self._stacked = self._weights.device.type != "cpu" or self._read_weights.dtype == torch.float64
+        members = [slice(None)] if self._stacked else range(len(read[0]))
+        self._networks = [Network([w[m] for w in read[0::2]], [b[m] for b in read[1::2]]) for m in members]
+        self._gradients = [[part[m] for part in gradients] for m in members]
+
+    def _arrange(self, batches: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Standardised inputs ``[U, K, B, F]``, in the dtype of the products, and targets ``[U, K, B, S]``."""
+        observation, runs = batches["observation"], self.num_runs or 1
+        raw = torch.cat([observation, batches["action"], batches["design"]], -1)
+        inputs = self.ensemble.inputs(raw).to(self._read_weights.dtype)
+        targets = self.ensemble.standardised_target(observation, batches["next", "observation"])
+        found = (x.reshape(len(x), -1, runs, x.shape[-1]).transpose(1, 2).contiguous() for x in (inputs, targets))
+        return next(found), next(found)
+
+    def _write_gradients(self, x: Tensor, target: Tensor) -> Tensor:
+        """Write the gradients of ``[K, B, F]`` and ``[K, B, S]`` where Adam reads them; returns the losses, ``[K]``."""
+        members = self.ensemble.num_members
+        if self._stacked:
+            batches = [(x.repeat_interleave(members, 0), target.repeat_interleave(members, 0))]
+        else:
+            batches = [pair for pair in zip(x, target) for _ in range(members)]
+        losses = []
+        for network, own, batch in zip(self._networks, self._gradients, batches):
+            gradients, loss = dynamics_gradients(network, *batch, log_var_range=LOG_VAR_RANGE)
+            for part, gradient in zip(own, gradients):
+                part.copy_(gradient)
+            losses.append(loss)
+        return torch.stack(losses).reshape(-1, members).sum(-1)

@@ -1,0 +1,167 @@
+"""The dynamics learner: its updates are those of `EnsembleNLLLoss` and Adam, and its errors mean what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import pytest
+import torch
+from conftest import ToyEnv
+from tensordict import TensorDict
+
+from coim import DynamicsLearner, EnsembleNLLLoss, GaussianEnsemble, select_run
+
+Rows = Callable[..., TensorDict]
+
+
+def ensemble_on(rows: TensorDict, *, dtype: torch.dtype = torch.float64, **kwargs: object) -> GaussianEnsemble:
+    torch.manual_seed(0)
+    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_cells=(16, 16), **kwargs).to(dtype)  # type: ignore[arg-type]
+    ensemble.update_statistics(rows)
+    return ensemble
+
+
+def learn_with_autograd(ensemble: GaussianEnsemble, batches: TensorDict) -> torch.Tensor:
+    """What defines an update; returns the mean loss."""
+    loss = EnsembleNLLLoss(ensemble)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=3e-4, weight_decay=1e-5)
+    history = []
+    for batch in batches:
+        optimiser.zero_grad()
+        history.append(loss(batch)["loss_dynamics"])
+        history[-1].backward()
+        optimiser.step()
+    return torch.stack(history).detach().mean()
+
+
+def assert_equal_weights(actual: GaussianEnsemble, expected: GaussianEnsemble, dtype: torch.dtype) -> None:
+    """To 1e-9 in float64; in float32 to 1e-5 of the largest weight of the layer."""
+    for ours, theirs in zip(actual.parameters(), expected.parameters(), strict=True):
+        limit = 1e-9 if dtype == torch.float64 else 1e-5 * float(theirs.detach().abs().max())
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("predict", ["delta", "next"])
+def test_updates_equal_the_loss_and_adam(make_rows: Rows, predict: str, dtype: torch.dtype) -> None:
+    batches = make_rows(20, 32, dtype=dtype)
+    ensemble = ensemble_on(batches, dtype=dtype, predict=predict)
+    expected = deepcopy(ensemble)
+    loss = DynamicsLearner(ensemble).update(batches)["loss_dynamics"]
+    expected_loss = learn_with_autograd(expected, batches)
+    torch.testing.assert_close(loss, expected_loss.reshape(1), rtol=1e-5, atol=0)
+    assert_equal_weights(ensemble, expected, dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("predict", ["delta", "next"])
+def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(
+    make_rows: Rows, predict: str, dtype: torch.dtype
+) -> None:
+    batches = make_rows(20, 32, 3, dtype=dtype)
+    fleet = ensemble_on(batches, dtype=dtype, predict=predict, num_runs=3)
+    alone = [select_run(fleet, k) for k in range(3)]
+    losses = DynamicsLearner(fleet, num_runs=3).update(batches)["loss_dynamics"]
+    for k, expected in enumerate(alone):
+        expected_loss = learn_with_autograd(expected, batches[:, :, k])
+        torch.testing.assert_close(losses[k], expected_loss, rtol=1e-5, atol=0)
+        assert_equal_weights(select_run(fleet, k), expected, dtype)
+
+
+@pytest.mark.parametrize("num_runs", [None, 2])
+def test_bfloat16_products_keep_loss_and_weights_close(make_rows: Rows, num_runs: int | None) -> None:
+    """To 0.05 % of the loss, and to 2 % of the way that the weights went in 20 updates."""
+    batches = make_rows(20, 256, *(() if num_runs is None else (num_runs,)), dtype=torch.float32)
+    start = ensemble_on(batches, dtype=torch.float32, num_runs=num_runs)
+    exact, rounded = deepcopy(start), deepcopy(start)
+    expected = DynamicsLearner(exact, num_runs=num_runs).update(batches)["loss_dynamics"]
+    learner = DynamicsLearner(rounded, num_runs=num_runs, precision="bfloat16")
+    loss = learner.update(batches)["loss_dynamics"]
+    torch.testing.assert_close(loss, expected, rtol=5e-4, atol=0)
+    flat = [torch.cat([p.detach().flatten() for p in e.parameters()]) for e in (start, exact, rounded)]
+    assert (
+        {p.dtype for p in rounded.parameters()} == {torch.float32} == {learner.loss(batches[0])["loss_dynamics"].dtype}
+    )
+    assert 0 < (flat[2] - flat[1]).norm() < 0.02 * (flat[1] - flat[0]).norm()
+
+
+def test_a_restored_learner_goes_on_as_if_it_had_never_stopped(make_rows: Rows) -> None:
+    batches = make_rows(2, 8)
+    learner, other = DynamicsLearner(ensemble_on(batches)), DynamicsLearner(ensemble_on(make_rows(3, 9, seed=1)))
+    learner.update(batches)
+    other.loss.load_state_dict(learner.loss.state_dict())
+    other.optimiser.load_state_dict(deepcopy(learner.optimiser.state_dict()))
+    learner.update(batches)
+    other.update(batches)
+    for ours, theirs in zip(other.ensemble.parameters(), learner.ensemble.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    assert learner.loss(batches[0])["loss_dynamics"] == other.loss(batches[0])["loss_dynamics"]
+
+
+def test_weights_loaded_into_the_ensemble_are_those_that_learn_on(make_rows: Rows) -> None:
+    batches = make_rows(2, 8)
+    learner, start = DynamicsLearner(ensemble_on(batches)), ensemble_on(batches)
+    learner.update(batches)
+    learner.ensemble.load_state_dict(start.state_dict())
+    learner.optimiser.state.clear()
+    learner.update(batches)
+    learn_with_autograd(start, batches)
+    assert_equal_weights(learner.ensemble, start, torch.float64)
+
+
+def test_the_input_is_left_untouched(make_rows: Rows) -> None:
+    batches = make_rows(2, 8)
+    before = batches.clone()
+    DynamicsLearner(ensemble_on(batches)).update(batches)
+    assert set(batches.keys(True, True)) == set(before.keys(True, True))
+    assert (batches == before).all()
+
+
+def test_bad_input_is_named(make_rows: Rows) -> None:
+    batches = make_rows(2, 8)
+    with pytest.raises(ValueError, match="precision='float16' is unknown; choose 'float32' or 'bfloat16'"):
+        DynamicsLearner(ensemble_on(batches), precision="float16")  # type: ignore[arg-type]
+    learner = DynamicsLearner(ensemble_on(batches))
+    with pytest.raises(ValueError, match="has no rows"):
+        learner.update(batches[:0])
+    with pytest.raises(ValueError, match="needs num_runs=3 as its last dimension"):
+        DynamicsLearner(ensemble_on(make_rows(2, 8, 3), num_runs=3), num_runs=3).update(batches)
+    with pytest.raises(RuntimeError, match="moved after its learner was made"):
+        deepcopy(learner).update(batches)
+    learner.ensemble.float()
+    with pytest.raises(RuntimeError, match="moved after its learner was made"):
+        learner.update(batches)
+
+
+def test_the_ensemble_learns_and_its_error_falls(make_rows: Rows) -> None:
+    torch.manual_seed(0)
+    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_members=2, num_cells=(32, 32)).double()
+    learner = DynamicsLearner(ensemble, lr=3e-3)
+    rows = make_rows(500, 1)
+    learner.observe(rows)
+    before = learner.error(rows)
+    batches = rows[torch.randint(500, (300, 64), generator=torch.Generator().manual_seed(0))]
+    first, last = (float(learner.update(part)["loss_dynamics"]) for part in (batches[:150], batches[150:]))
+    assert before.shape == (1,)
+    assert last < first
+    assert float(learner.error(rows)) < 0.2 * float(before)
+
+
+def test_predicting_no_change_scores_one() -> None:
+    class Still:
+        """Says that the next observation is this one."""
+
+        def moments(self, observation: torch.Tensor, action: torch.Tensor, design: torch.Tensor) -> tuple:
+            return observation.unsqueeze(-2), None
+
+        def wrapped(self, x: torch.Tensor) -> torch.Tensor:
+            return x
+
+    learner = DynamicsLearner.__new__(DynamicsLearner)
+    learner.ensemble = Still()  # type: ignore[assignment]
+    observation = torch.zeros(1000, 1, 3)
+    following = torch.randn(1000, 1, 3, generator=torch.Generator().manual_seed(0))
+    rows = TensorDict({"observation": observation, "action": observation, "design": observation}, [1000, 1])
+    rows["next"] = TensorDict({"observation": following}, [1000, 1])
+    torch.testing.assert_close(learner.error(rows), torch.ones(1), rtol=0, atol=0.01)
