@@ -1,12 +1,9 @@
-"""Where designs come from: the generators G of the imagination, and the search for the next body.
+"""Search for the next body by a swarm of particles.
 
 Shapes: ``*B`` any batch, ``D`` design entries, ``P`` particles (candidate designs tried at once).
 
-A generator is a callable ``(design, *, rng=None) -> design`` (:class:`DesignGenerator`), a search an object with
-``maximise(fitness) -> (design, value)`` (:class:`DesignSearch`); one class with one method adds another of either.
-
 References:
-    Co-Imagination of Behaviour and Morphology of Agents: Eq. 5 (what the search maximises), Sec. 5 (the three G).
+    Co-Imagination of Behaviour and Morphology of Agents: Eq. 5 (what is maximised), Sec. 4.
 
     J. Kennedy and R. Eberhart, *Particle swarm optimization*, IEEE International Conference on Neural Networks, 1995;
     as implemented in `pyswarms <https://pyswarms.readthedocs.io>`_.
@@ -15,15 +12,18 @@ References:
 from __future__ import annotations
 
 import logging.config
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 from unittest import mock
 
 import numpy as np
 import torch
 from torch import Tensor
 from torchrl.data import Bounded
+
+from .bounds import bounds_of
+from .search import Fitness, evaluate
 
 
 @contextmanager
@@ -42,92 +42,6 @@ with _no_reports():
     from pyswarms.backend.operators import compute_pbest
     from pyswarms.backend.swarms import Swarm
     from pyswarms.backend.topology import Star
-
-
-class DesignGenerator(Protocol):
-    """What :func:`coim.imagine` asks for the designs of imagined rows: G of Eq. 7-8."""
-
-    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
-        """Give each row the design ``[*B, D]`` that it is imagined with, from the ``[*B, D]`` that it was seen with."""
-
-
-class DesignSearch(Protocol):
-    """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`."""
-
-    def maximise(self, fitness: Callable[[Tensor], Tensor]) -> tuple[Tensor, float]:
-        """Return the best design ``[D]`` found and its fitness; ``fitness`` maps ``[P, D]`` to ``[P]``."""
-
-
-class KnownDesigns:
-    """G(xi) = xi: every row keeps the design that it was seen with (Sec. 6.3).
-
-    Example:
-        >>> KnownDesigns()(torch.tensor([[1.0, 1.5]]))
-        tensor([[1.0000, 1.5000]])
-    """
-
-    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
-        """Return ``design`` itself, ``[*B, D]``; nothing is drawn."""
-        return design
-
-
-class NoisyDesigns:
-    """G(xi) = N(xi, sigma^2), clipped to the bounds (Sec. 6.4).
-
-    The paper leaves open what becomes of a draw outside of the bounds: it is clipped, entry by entry.
-
-    Args:
-        spec: bounds of one design, ``[D]``, as ``env.design_spec``.
-        sigma: standard deviation, the same for every entry, in units of the scale factors.
-
-    Raises:
-        ValueError: if ``spec`` is not one bounded design, or ``sigma`` is negative.
-
-    Example:
-        >>> spec = Bounded(low=0.8, high=2.0, shape=(2,))
-        >>> NoisyDesigns(spec, sigma=0.0)(torch.tensor([[1.0, 3.0]]))
-        tensor([[1., 2.]])
-    """
-
-    def __init__(self, spec: Bounded, *, sigma: float = 0.1) -> None:
-        if not sigma >= 0.0:
-            raise ValueError(f"sigma is {sigma}, a standard deviation is 0 or more; KnownDesigns() adds no noise")
-        self._low, self._high = _bounds(spec)
-        self.sigma = sigma
-
-    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
-        """Return a noisy copy of ``design``, ``[*B, D]``, drawn with ``rng`` (default: torch's global generator)."""
-        low, high = _bounds_for(design, self._low, self._high)
-        noise = torch.randn(design.shape, generator=rng, dtype=design.dtype, device=design.device)
-        return (design + self.sigma * noise).clamp(low, high)
-
-
-class RandomDesigns:
-    """G(xi) = uniform(Xi): every row gets a fresh design from the whole design space (Sec. 6.4).
-
-    Also the exploration step of Algorithm 1.
-
-    Args:
-        spec: bounds of one design, ``[D]``, as ``env.design_spec``.
-
-    Raises:
-        ValueError: if ``spec`` is not one bounded design.
-
-    Example:
-        >>> spec = Bounded(low=0.8, high=2.0, shape=(2,))
-        >>> spec.is_in(RandomDesigns(spec)(torch.ones(2)))
-        tensor(True)
-    """
-
-    def __init__(self, spec: Bounded) -> None:
-        self._low, self._high = _bounds(spec)
-
-    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
-        """Return uniform designs of ``design``'s shape ``[*B, D]``, drawn with ``rng`` (default: the global one)."""
-        low, high = _bounds_for(design, self._low, self._high)
-        uniform = torch.rand(design.shape, generator=rng, dtype=design.dtype, device=design.device)
-        # low + (high - low) * u can round to just above high.
-        return torch.minimum(low + (high - low) * uniform, high)
 
 
 class ParticleSwarm:
@@ -182,7 +96,7 @@ class ParticleSwarm:
             raise ValueError(f"{num_particles} particles x {num_iterations} iterations: both must be at least 1")
         if bounds not in ("nearest", "periodic"):
             raise ValueError(f"bounds={bounds!r} is an unknown option; take 'nearest' or 'periodic'")
-        self._low, self._high = _bounds(spec)
+        self._low, self._high = bounds_of(spec)
         self.bounds = bounds
         self.num_particles = num_particles
         self.num_iterations = num_iterations
@@ -190,7 +104,7 @@ class ParticleSwarm:
         # pyswarms draws from numpy's global generator, whose state is of this legacy kind.
         self._random_state: Any = np.random.RandomState(seed).get_state()
 
-    def maximise(self, fitness: Callable[[Tensor], Tensor]) -> tuple[Tensor, float]:
+    def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:
         """Search the design of highest fitness.
 
         Args:
@@ -209,7 +123,9 @@ class ParticleSwarm:
             swarm: Swarm = create_swarm(self.num_particles, len(limits[0]), options=self.options, bounds=limits)
         swarm.pbest_cost = np.full(self.num_particles, np.inf)
         for _ in range(self.num_iterations):
-            swarm.current_cost = -self._evaluate(fitness, self._candidates(swarm.position))
+            with torch.no_grad():
+                values = evaluate(fitness, self._candidates(swarm.position))
+            swarm.current_cost = -values.double().cpu().numpy()
             swarm.pbest_pos, swarm.pbest_cost = compute_pbest(swarm)
             swarm.best_pos, swarm.best_cost = star.compute_gbest(swarm)
             with self._own_random_numbers():
@@ -231,24 +147,6 @@ class ParticleSwarm:
         """Turn pyswarms' float64 places into designs, ``[*B, D]``, inside the bounds exactly."""
         return torch.as_tensor(position, dtype=self._low.dtype, device=self._low.device).clamp(self._low, self._high)
 
-    def _evaluate(self, fitness: Callable[[Tensor], Tensor], designs: Tensor) -> np.ndarray:
-        """Call the fitness and check what it returns, ``[P, D] -> [P]``."""
-        with torch.no_grad():
-            values = fitness(designs)
-        if values.shape != designs.shape[:1]:
-            raise ValueError(
-                f"the fitness of {len(designs)} designs has shape {list(values.shape)}, [{len(designs)}] is needed: "
-                "return one value per design"
-            )
-        broken = ~values.isfinite()
-        if broken.any():
-            first = int(broken.nonzero()[0])
-            raise ValueError(
-                f"the fitness is {values[first].item()} for the design {designs[first].tolist()}, and not finite for "
-                f"{int(broken.sum())} of {len(designs)} designs: check the networks that compute it"
-            )
-        return values.double().cpu().numpy()
-
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
         """Exchange numpy's global state for the swarm's, and back."""
@@ -259,20 +157,3 @@ class ParticleSwarm:
         finally:
             self._random_state = np.random.get_state()  # noqa: NPY002
             np.random.set_state(outside)  # noqa: NPY002
-
-
-def _bounds(spec: Bounded) -> tuple[Tensor, Tensor]:
-    """Return lowest and highest design, each ``[D]``, of a spec."""
-    if not hasattr(spec.space, "low") or len(spec.shape) != 1:
-        raise ValueError(f"{spec} is not the bounds of one design; pass env.design_spec, a Bounded of shape [D]")
-    return spec.space.low, spec.space.high
-
-
-def _bounds_for(design: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the bounds on ``design``'s device and in its dtype, or say that its length is wrong."""
-    if design.shape[-1:] != low.shape:
-        raise ValueError(
-            f"a design of shape {list(design.shape)} has not the {len(low)} entries of the design space; "
-            f"pass [*B, {len(low)}]"
-        )
-    return low.to(design), high.to(design)

@@ -1,0 +1,45 @@
+"""What a search for the next body is, and what it asks of the fitness that it maximises.
+
+Shapes: ``D`` design entries, ``P`` candidate designs tried at once.
+
+References:
+    Co-Imagination of Behaviour and Morphology of Agents: Eq. 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from torch import Tensor
+
+Fitness = Callable[[Tensor], Tensor]
+
+
+class DesignSearch(Protocol):
+    """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`."""
+
+    def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:
+        """Return the best design ``[D]`` found and its fitness; ``fitness`` maps ``[P, D]`` to ``[P]``."""
+
+
+def evaluate(fitness: Fitness, designs: Tensor) -> Tensor:
+    """Call a fitness and check what it returns, ``[P, D] -> [P]``.
+
+    Raises:
+        ValueError: if it returns another shape, or a value that is not finite.
+    """
+    values = fitness(designs)
+    if values.shape != designs.shape[:1]:
+        raise ValueError(
+            f"the fitness of {len(designs)} designs has shape {list(values.shape)}, [{len(designs)}] is needed: "
+            "return one value per design"
+        )
+    broken = ~values.isfinite()
+    if broken.any():
+        first = int(broken.nonzero()[0])
+        raise ValueError(
+            f"the fitness is {values[first].item()} for the design {designs[first].tolist()}, and not finite for "
+            f"{int(broken.sum())} of {len(designs)} designs: check the networks that compute it"
+        )
+    return values
