@@ -5,11 +5,20 @@ Everything that is public, in one flat list. Importing it starts nothing, reads 
 
 from coim.buffers import Buffers, TransitionBuffer, sample_batches, sample_mixed, transition_rows
 from coim.coadaptation import CoAdaptation, DesignChosen, DesignDone, EpisodeDone, Event
-from coim.designs import DesignGenerator, DesignSearch, KnownDesigns, NoisyDesigns, ParticleSwarm, RandomDesigns
+from coim.designs import (
+    DesignGenerator,
+    DesignSearch,
+    GradientSearch,
+    KnownDesigns,
+    NoisyDesigns,
+    ParticleSwarm,
+    RandomDesigns,
+)
+from coim.dynamics_learner import DynamicsLearner
 from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, WorldModelEnv
 from coim.episode import run_episode
 from coim.imagination import imagine
-from coim.learner import DynamicsLearner, SACLearner
+from coim.learner import SACLearner
 from coim.models import GaussianEnsemble, Policy, QValue, StackedMLP, make_policy, make_qvalue, select_run
 from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
 
@@ -29,6 +38,7 @@ __all__ = [
     "EpisodeDone",
     "Event",
     "GaussianEnsemble",
+    "GradientSearch",
     "HalfCheetahMorph",
     "HopperMorph",
     "KnownDesigns",

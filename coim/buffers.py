@@ -191,13 +191,21 @@ class Buffers:
             getattr(self, field.name).load_state_dict(state_dict[field.name])
 
 
-def sample_batches(buffer: TensorDictReplayBuffer, *, batch_size: int = 256, num_batches: int = 1) -> TensorDict:
+def sample_batches(
+    buffer: TensorDictReplayBuffer,
+    *,
+    batch_size: int = 256,
+    num_batches: int = 1,
+    rng: torch.Generator | None = None,
+) -> TensorDict:
     """Draw many batches in one call, uniformly and with replacement.
 
     Args:
         buffer: elements of batch size ``[K]``.
         batch_size: B, elements per batch.
         num_batches: batches drawn at once; fifty cost hardly more than one.
+        rng: draws the rows, on the buffer's device; None takes the buffer's own generator. Readers that run at the same
+            time need generators of their own, or who comes first decides what each of them gets.
 
     Returns:
         ``[num_batches, B, K]`` rows without TorchRL's ``index``.
@@ -209,7 +217,10 @@ def sample_batches(buffer: TensorDictReplayBuffer, *, batch_size: int = 256, num
         raise ValueError(f"{num_batches} batches of {batch_size} rows: both numbers must be at least 1")
     if len(buffer) == 0:
         raise ValueError(f"{batch_size} rows are wanted of an empty buffer; extend() it with transitions first")
-    rows = buffer.sample(num_batches * batch_size)
+    if rng is None:
+        rows = buffer.sample(num_batches * batch_size)
+    else:
+        rows = buffer[torch.randint(len(buffer), (num_batches * batch_size,), generator=rng, device=rng.device)]
     return rows.exclude("index").unflatten(0, (num_batches, batch_size))
 
 
@@ -218,6 +229,7 @@ def sample_mixture(
     num_batches: int = 1,
     *,
     imagined: TensorDictReplayBuffer | None = None,
+    rng: torch.Generator | None = None,
 ) -> TensorDict:
     """Draw batches that are put together from several buffers, each with its exact number of rows.
 
@@ -226,6 +238,7 @@ def sample_mixture(
             gives 0 rows may be empty.
         num_batches: batches drawn at once.
         imagined: which of the buffers holds imagined rows, Replay_Art; None writes no ``imagined``.
+        rng: as for :func:`sample_batches`.
 
     Returns:
         ``[num_batches, B, K]`` rows, B the sum of all rows, with ``imagined`` ``[num_batches, B, K, 1]`` written.
@@ -244,7 +257,7 @@ def sample_mixture(
     for buffer, num_rows in sources:
         if num_rows == 0:
             continue
-        rows = sample_batches(buffer, batch_size=num_rows, num_batches=num_batches)
+        rows = sample_batches(buffer, batch_size=num_rows, num_batches=num_batches, rng=rng)
         if imagined is not None:
             flag = torch.full((*rows.batch_size, 1), buffer is imagined, device=rows["design"].device)
             rows.set("imagined", flag)

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -22,11 +24,12 @@ from torch import Tensor
 
 from coim.buffers import Buffers, sample_mixture
 from coim.designs import DesignGenerator, DesignSearch, RandomDesigns
+from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
 from coim.episode import run_episode
 from coim.imagination import imagine
-from coim.learner import DynamicsLearner, SACLearner
+from coim.learner import SACLearner
 from coim.models.stacked import select_run
 from coim.objectives.design import DesignValue
 
@@ -65,8 +68,8 @@ class EpisodeDone:
         evaluation_return: undiscounted, of the deterministic individual policy, ``[K]``.
         env_steps: training steps of one run so far; evaluation steps are not counted, nothing is learnt from them.
         imagined: rows in Replay_Art of one run.
-        metrics: per-run means over the updates: losses, entropies, ``model_error``.
-        seconds: wall-clock by part.
+        metrics: means over the updates, each ``[K]``: losses, entropies, ``model_error``.
+        seconds: wall-clock by part; parts that run side by side overlap, ``episode`` is the whole.
     """
 
     index: int
@@ -77,7 +80,7 @@ class EpisodeDone:
     evaluation_return: Tensor
     env_steps: int
     imagined: int
-    metrics: dict[str, float]
+    metrics: dict[str, Tensor]
     seconds: dict[str, float]
 
 
@@ -101,27 +104,15 @@ class DesignDone:
 Event = DesignChosen | EpisodeDone | DesignDone
 
 
-@dataclass
-class Stopwatch:
-    """Seconds spent per named part."""
+Means = dict[str, Tensor]
 
-    seconds: dict[str, float] = field(default_factory=dict)
-    _since: float = field(default_factory=time.perf_counter)
 
-    def lap(self, part: str) -> None:
-        """Book the time since the last lap to a part."""
-        now = time.perf_counter()
-        self.seconds[part] = self.seconds.get(part, 0.0) + now - self._since
-        self._since = now
-
-    def restart(self) -> None:
-        """Count from now on."""
-        self._since = time.perf_counter()
-
-    def read(self) -> dict[str, float]:
-        """What was booked since the last read."""
-        seconds, self.seconds = self.seconds, {}
-        return seconds
+@contextmanager
+def booked(seconds: dict[str, float], part: str) -> Iterator[None]:
+    """Book the wall-clock of a block to a part."""
+    start = time.perf_counter()
+    yield
+    seconds[part] = time.perf_counter() - start
 
 
 class CoAdaptation:
@@ -143,7 +134,8 @@ class CoAdaptation:
         episodes: episodes on every later design.
         individual_updates: updates of the individual learner per episode.
         population_updates: updates of the population learner per episode.
-        model_updates: updates of the ensemble per episode.
+        model_updates: updates of the ensemble per episode; the paper does not give them, by default as many as the
+            population's.
         batch_size: rows in a batch of any of them.
         imagined_share: share of a population batch drawn from Replay_Art (Sec. 5).
         individual_mix: share of an individual batch drawn from Replay_Pop ("primarily", Sec. 4; 0 in Algorithm 1).
@@ -151,11 +143,13 @@ class CoAdaptation:
             individual networks too, Sec. 5 gives imagined rows to the population alone; 0 follows Sec. 5.
         num_start_states: n, start states that Eq. 5 averages over.
         imagined_rows: rows in Replay_Art after a refresh; None takes one for each imagined row of the coming updates.
+        side_by_side: train the individual learner in one thread while another trains the population's and the ensemble.
+            They do not depend on each other, and the result is the same to the last bit.
         seed: seeds the generators of the actions, the imagination and the random designs.
 
     Raises:
-        ValueError: if a count is below its least value, a share outside [0, 1], shares leave no row, first designs have
-            the wrong shape, or only one of ``dream`` and ``generator`` is given.
+        ValueError: if a count is below its least value, a share outside [0, 1] or of less than a row, first designs
+            have the wrong shape, or only one of ``dream`` and ``generator`` is given.
 
     Note:
         Evaluation episodes leave no trace in the replay. The predecessor's code also skips training in the first three
@@ -187,6 +181,7 @@ class CoAdaptation:
         individual_imagined_share: float = 0.0,
         num_start_states: int = 36,
         imagined_rows: int | None = None,
+        side_by_side: bool = False,
         seed: int = 0,
     ) -> None:
         if (dream is None) != (generator is None):
@@ -227,11 +222,12 @@ class CoAdaptation:
         self.imagined_rows = imagined_rows if imagined_rows is not None else self._rows_to_draw()
         self.index, self.env_steps = 0, 0
         seeds = torch.Generator().manual_seed(seed)
-        self._action_rng, self._dream_rng, self._design_rng = (
-            torch.Generator(env.device or "cpu").manual_seed(int(torch.randint(2**62, (), generator=seeds)))
-            for _ in range(3)
-        )
-        self._clock = Stopwatch()
+        # One generator for each reader and writer, so that nothing depends on who comes first.
+        self._rng = {
+            name: torch.Generator(env.device or "cpu").manual_seed(int(torch.randint(2**62, (), generator=seeds)))
+            for name in ("actions", "dream", "designs", "individual", "population", "model")
+        }
+        self._beside = ThreadPoolExecutor(1, "coim-population") if side_by_side else None
 
     def __iter__(self) -> Iterator[Event]:
         while self.index < self.num_designs:
@@ -246,8 +242,9 @@ class CoAdaptation:
                 event = self._run_and_learn(kind, design, episode)
                 best = torch.maximum(best, event.evaluation_return.cpu())
                 yield event
-            yield DesignDone(self.index, kind, design, best)
-            self.index += 1
+            done = DesignDone(self.index, kind, design, best)
+            self.index += 1  # before the event: who stops there and comes back goes on with the next design
+            yield done
 
     def _episodes_of(self, index: int) -> int:
         return self.first_episodes if index < len(self.first_designs) else self.episodes
@@ -255,25 +252,21 @@ class CoAdaptation:
     # -- the first loop of Algorithm 1: behaviour and networks --------------------------------------------------------
 
     def _run_and_learn(self, kind: Kind, design: Tensor, episode: int) -> EpisodeDone:
-        self._clock.restart()  # the time between two events is the caller's
-        # Collect experience for the current design with pi_Ind.
-        rows = run_episode(self.env, self.individual.policy, design=design, rng=self._action_rng)
-        self.buffers.ind.extend(rows)
-        self.buffers.pop.extend(rows)
-        self._clock.lap("collect")
-        # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
-        metrics = self._observe(rows)
-        self._refresh_imagined()
-        self._clock.lap("imagine")
-        self.buffers.s0.extend(rows[:1])
-        # Train pi_Ind and Q_Ind, then pi_Pop and Q_Pop, then the ensemble.
-        metrics |= self._train("individual", self.individual, self.individual_parts, self.individual_updates)
-        metrics |= self._train("population", self.population, self.population_parts, self.population_updates)
-        if self.dynamics is not None:
-            parts = batch_parts(self.batch_size)
-            metrics |= self._train("model", self.dynamics, parts, self.model_updates)
-        evaluation = run_episode(self.evaluation_env, self.individual.policy, design=design, deterministic=True)
-        self._clock.lap("evaluate")
+        seconds: dict[str, float] = {}
+        with booked(seconds, "episode"):
+            # Collect experience for the current design with pi_Ind.
+            with booked(seconds, "collect"):
+                rows = run_episode(self.env, self.individual.policy, design=design, rng=self._rng["actions"])
+                self.buffers.ind.extend(rows)
+                self.buffers.pop.extend(rows)
+            # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
+            with booked(seconds, "imagine"):
+                metrics = self._observe(rows)
+                self._refresh_imagined()
+            self.buffers.s0.extend(rows[:1])
+            metrics |= self._learn(seconds)
+            with booked(seconds, "evaluate"):
+                evaluation = run_episode(self.evaluation_env, self.individual.policy, design=design, deterministic=True)
         self.env_steps += len(rows)
         return EpisodeDone(
             index=self.index,
@@ -285,15 +278,15 @@ class CoAdaptation:
             env_steps=self.env_steps,
             imagined=len(self.buffers.art),
             metrics=metrics,
-            seconds=self._clock.read(),
+            seconds=seconds,
         )
 
-    def _observe(self, rows: TensorDictBase) -> dict[str, float]:
+    def _observe(self, rows: TensorDictBase) -> Means:
         """Scale the ensemble by the new rows, and say how well it foresaw them before it learns from them."""
         if self.dynamics is None:
             return {}
         self.dynamics.observe(rows)
-        return {"model_error": float(self.dynamics.error(rows).mean())}
+        return {"model_error": self.dynamics.error(rows).cpu()}
 
     def _refresh_imagined(self) -> None:
         """Empty Replay_Art and fill it with states of Replay_Pop, designs of G, and actions of pi_Pop."""
@@ -301,7 +294,7 @@ class CoAdaptation:
         if self.dream is None or self.generator is None or len(self.buffers.pop) == 0:
             return
         states = self.buffers.pop.sample(self.imagined_rows)
-        rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self._dream_rng)
+        rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self._rng["dream"])
         self.buffers.art.extend(rows)
 
     def _rows_to_draw(self) -> int:
@@ -309,20 +302,39 @@ class CoAdaptation:
         population = self.population_updates * self.population_parts.imagined
         return max(1, population + self.individual_updates * self.individual_parts.imagined)
 
+    def _learn(self, seconds: dict[str, float]) -> Means:
+        """Train pi_Ind and Q_Ind, then pi_Pop and Q_Pop, then the ensemble; or the first beside the other two."""
+
+        def population_and_model() -> Means:
+            means = self._train("population", self.population, self.population_parts, self.population_updates, seconds)
+            if self.dynamics is None:
+                return means
+            parts = batch_parts(self.batch_size)
+            return means | self._train("model", self.dynamics, parts, self.model_updates, seconds)
+
+        beside = None if self._beside is None else self._beside.submit(population_and_model)
+        means = self._train("individual", self.individual, self.individual_parts, self.individual_updates, seconds)
+        return means | (population_and_model() if beside is None else beside.result())
+
     def _train(
-        self, name: str, learner: SACLearner | DynamicsLearner, parts: BatchParts, updates: int
-    ) -> dict[str, float]:
-        """Draw batches by their parts and learn from them; returns the mean of each metric over updates and runs."""
+        self,
+        name: str,
+        learner: SACLearner | DynamicsLearner,
+        parts: BatchParts,
+        updates: int,
+        seconds: dict[str, float],
+    ) -> Means:
+        """Draw batches by their parts and learn from them; returns the mean of each metric, ``[K]``."""
         own = self.buffers.ind if name == "individual" else self.buffers.pop
-        means: dict[str, float] = {}
-        for done in range(0, updates, UPDATES_PER_SAMPLE):
-            count = min(UPDATES_PER_SAMPLE, updates - done)
-            sources = ((own, parts.own), (self.buffers.pop, parts.other), (self.buffers.art, parts.imagined))
-            batches = sample_mixture(sources, count, imagined=self.buffers.art)
-            for key, value in learner.update(batches).items():
-                means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + float(value) * count / updates
-        self._clock.lap(f"train {name}")
-        return {key: value / self.env.batch_size.numel() for key, value in means.items()}
+        sources = ((own, parts.own), (self.buffers.pop, parts.other), (self.buffers.art, parts.imagined))
+        means: Means = {}
+        with booked(seconds, f"train {name}"):
+            for done in range(0, updates, UPDATES_PER_SAMPLE):
+                count = min(UPDATES_PER_SAMPLE, updates - done)
+                batches = sample_mixture(sources, count, imagined=self.buffers.art, rng=self._rng[name])
+                for key, value in learner.update(batches).items():
+                    means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + value.cpu() * (count / updates)
+        return means
 
     # -- the second loop of Algorithm 1: design -----------------------------------------------------------------------
 
@@ -336,7 +348,7 @@ class CoAdaptation:
         if since % 2 == 0:
             found = [self.search.maximise(fitness) for fitness in self._fitness()]
             return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
-        design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self._design_rng)
+        design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self._rng["designs"])
         return "random", design, self._predict(design)
 
     def _fitness(self) -> list[DesignValue]:
@@ -372,7 +384,7 @@ def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -
         other: share from a second real buffer, in [0, 1].
 
     Raises:
-        ValueError: if a share leaves [0, 1], or the shares need more rows than there are.
+        ValueError: if a share leaves [0, 1], the shares need more rows than there are, or one is too small for a row.
 
     Example:
         >>> batch_parts(256, imagined=0.2)
@@ -382,9 +394,16 @@ def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"the {name} share is {share}, it must lie in [0, 1]")
     rows = round(batch_size * imagined), round(batch_size * other)
-    if sum(rows) > batch_size:
+    own = batch_size - sum(rows)
+    if own < 0:
         raise ValueError(f"shares {imagined} and {other} of a batch of {batch_size} rows need {sum(rows)}; lower them")
-    return BatchParts(own=batch_size - sum(rows), other=rows[1], imagined=rows[0])
+    wanted = (1 - imagined - other, own), (other, rows[1]), (imagined, rows[0])
+    if any(share > 1e-9 and not count for share, count in wanted):
+        raise ValueError(
+            f"a batch of {batch_size} rows is smaller than its parts: shares {imagined} and {other} make it {own} + "
+            f"{rows[1]} + {rows[0]} rows; enlarge the batch, or set a share to 0"
+        )
+    return BatchParts(own=own, other=rows[1], imagined=rows[0])
 
 
 def episode_return(rows: TensorDictBase) -> Tensor:

@@ -45,7 +45,8 @@ def imagine(
             the policy draw from the global generator and the dream from its own.
 
     Returns:
-        Rows ``[N]`` or ``[N, K]`` with the schema of the buffers, without gradients; nothing is terminated.
+        Rows ``[N]`` or ``[N, K]`` with the schema of the buffers, without gradients; nothing is terminated. The next
+        design is xi_g too: what Eq. 7 prints as V(h(s, a_g, xi_g)) is read as V(h(s, a_g, xi_g), xi_g).
 
     Raises:
         ValueError: if there are no states, an entry is missing, or the model predicts a number that is not finite.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 import time
 from collections.abc import Sequence
@@ -29,20 +28,21 @@ from coim import (
     make_policy,
     make_qvalue,
 )
+from coim.coadaptation import batch_parts
 from coim.designs import DesignGenerator
+from recipes.machine import available_cores, checked_device, prepare
 from recipes.pictures import draw_run
 from recipes.progress import Progress
 from recipes.results import Results, default_folder, describe
-from recipes.settings import Settings, available_cores, episodes_of, parse
+from recipes.settings import Settings, episodes_of, parse
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
     """Command line of one environment's recipe."""
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it reports every storage that it allocates
     settings = parse(f"python -m recipes.{name}", f"Co-adapt {body.__name__}: body and controller together.", arguments)
     try:
         run(body, name, settings)
-    except (ValueError, FileExistsError, PermissionError) as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"{type(error).__name__}: {error}")
 
 
@@ -58,8 +58,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
         The folder.
     """
     threads = settings.threads or available_cores()
-    torch.set_num_threads(threads)
-    algorithm = build(body, settings, threads=threads)
+    side_by_side = prepare(threads, checked_device(settings.device))
+    algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
     folder = settings.out or default_folder(name, settings)
     results = Results(folder, name, settings, algorithm.env.design_spec.shape[0])
     progress = Progress(
@@ -70,7 +70,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
     )
     logger = open_wandb(folder, name, settings)
     if not settings.quiet:
-        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {threads} threads -> {folder}")
+        learners = "learners side by side, one thread each" if side_by_side else "one thread"
+        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners} -> {folder}")
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)
@@ -85,7 +86,7 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
     return folder
 
 
-def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1) -> CoAdaptation:
+def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by_side: bool = False) -> CoAdaptation:
     """Make the parts of Algorithm 1 and put them together."""
     device = checked_device(settings.device)
     # Streams of one seed that have nothing in common, nor with those of the next seed.
@@ -160,6 +161,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1) -> CoAd
         individual_mix=settings.individual_mix,
         individual_imagined_share=settings.individual_imagined_share,
         num_start_states=settings.num_start_states,
+        side_by_side=side_by_side,
         seed=next(seeds),
     )
 
@@ -175,30 +177,21 @@ def make_generator(env: MorphEnv, settings: Settings) -> DesignGenerator | None:
 
 def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
     """Four buffers that can hold everything this run will ever put into them."""
-    episodes = [episodes_of(settings, index) for index in range(settings.num_designs)]
-    imagined = settings.population_updates * settings.imagined_share
-    imagined += settings.individual_updates * settings.individual_imagined_share
+    episodes = [episodes_of(settings, index) for index in range(settings.num_designs)] or [1]
+    population = batch_parts(settings.batch_size, imagined=settings.imagined_share)
+    individual = batch_parts(
+        settings.batch_size, imagined=settings.individual_imagined_share, other=settings.individual_mix
+    )
+    imagined = settings.population_updates * population.imagined + settings.individual_updates * individual.imagined
     return Buffers.for_env(
         env,
         pop_capacity=sum(episodes) * settings.episode_steps,
         ind_capacity=max(episodes) * settings.episode_steps,
         s0_capacity=sum(episodes),
-        art_capacity=round(imagined * settings.batch_size) + settings.batch_size,
+        art_capacity=max(1, imagined),
         seed=seed,
         device=checked_device(settings.device),
     )
-
-
-def checked_device(name: str) -> torch.device:
-    """The device, or a sentence that says why it cannot be used."""
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(
-            f"device {name!r} cannot be used here ({str(error).splitlines()[0]}); try --device cpu"
-        ) from None
-    return device
 
 
 def open_wandb(folder: Path, environment: str, settings: Settings) -> WandbLogger | None:
@@ -218,10 +211,11 @@ def log(logger: WandbLogger, event: Event, *, num_runs: int) -> None:
     """The numbers of the CSV files, one series for each run, over training steps."""
     if not isinstance(event, EpisodeDone):
         return
-    scalars = dict(event.metrics) | {f"seconds/{part}": value for part, value in event.seconds.items()}
+    scalars = {f"seconds/{part}": value for part, value in event.seconds.items()}
     for run in range(num_runs):
         scalars[f"run {run}/return"] = float(event.evaluation_return[run])
         scalars[f"run {run}/training return"] = float(event.training_return[run])
+        scalars |= {f"run {run}/{key}": float(values[run]) for key, values in event.metrics.items()}
         scalars |= {f"run {run}/xi_{i + 1}": float(xi) for i, xi in enumerate(event.design[run])}
     for name, value in scalars.items():
         logger.log_scalar(name, value, step=event.env_steps)

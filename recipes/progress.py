@@ -47,7 +47,7 @@ class Progress:
         self._stream.flush()
 
     def _line(self, event: EpisodeDone, last: float) -> str:
-        seconds = sum(event.seconds.values())
+        seconds = event.seconds["episode"]
         error = event.metrics.get("model_error")
         left = (self._total - self._episodes) * (time.perf_counter() - self._started) / self._episodes
         return "  ".join(
@@ -56,7 +56,7 @@ class Progress:
                 f"episode {event.episode + 1}",
                 f"return {last:.1f} (best {self._best:.1f})",
                 f"imagined {event.imagined}",
-                "model error " + ("-" if error is None else f"{error:.3f}"),
+                "model error " + ("-" if error is None else f"{float(error.mean()):.3f}"),
                 f"{self._updates / seconds:.0f} updates/s",
                 f"{_clock(left)} left",
             ]

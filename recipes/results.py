@@ -65,12 +65,12 @@ class Results:
             nothing = [None] * len(event.design)
             self._predicted = nothing if event.predicted is None else event.predicted.tolist()
         elif isinstance(event, EpisodeDone):
-            done = event.env_steps, event.metrics.get("model_error"), seconds
+            nothing = [None] * len(event.design)
+            errors = event.metrics["model_error"].tolist() if "model_error" in event.metrics else nothing
+            returns = event.training_return.tolist(), event.evaluation_return.tolist()
             self._evaluations.append(
-                [run, event.index + 1, event.kind, *xi, event.episode + 1, trained, evaluated, *done]
-                for run, (xi, trained, evaluated) in enumerate(
-                    zip(event.design.tolist(), event.training_return.tolist(), event.evaluation_return.tolist())
-                )
+                [run, event.index + 1, event.kind, *xi, event.episode + 1, *scores, event.env_steps, error, seconds]
+                for run, (xi, *scores, error) in enumerate(zip(event.design.tolist(), *returns, errors))
             )
         else:
             self._designs.append(

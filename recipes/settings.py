@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -94,7 +93,7 @@ class Settings:
     device: str = "cpu"
     """Where the networks live: cpu, cuda, cuda:1, ..."""
     threads: int = 0
-    """Threads of torch and of the simulation; 0 takes one for each core that this process may use."""
+    """Threads that may be busy at once; 0 takes one for each core that this process may use."""
     out: Path | None = None
     """Folder for the results; by default runs/ENVIRONMENT-DATE-NAME."""
     name: str = "run"
@@ -136,14 +135,14 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
     first.add_argument("--preset", default="paper")
     preset = first.parse_known_args(arguments)[0].preset
     default = PRESETS.get(preset, PRESETS["paper"])  # an unknown name is refused below, with the names that exist
-    return tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
+    settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
+    if settings.seed < 0:
+        first.error(f"--seed is {settings.seed}, it must be at least 0")
+    if settings.sigma < 0:
+        first.error(f"--sigma is {settings.sigma}, a standard deviation is at least 0")
+    return settings
 
 
 def episodes_of(settings: Settings, index: int, *, num_first: int = 5) -> int:
     """Training episodes of one design."""
     return settings.first_episodes if index < num_first else settings.episodes
-
-
-def available_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

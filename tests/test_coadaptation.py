@@ -157,6 +157,20 @@ def test_the_same_seed_gives_the_same_events() -> None:
     assert torch.equal(torch.stack(first), torch.stack(second))
 
 
+@pytest.mark.parametrize(
+    "shares", [{}, {"individual_mix": 0.2, "individual_imagined_share": 0.3}], ids=["paper", "mixed"]
+)
+def test_side_by_side_is_one_after_the_other_to_the_last_bit(shares: dict[str, float]) -> None:
+    together, apart = (small(num_designs=4, side_by_side=together, **shares) for together in (True, False))
+    for event, expected in zip(together, apart, strict=True):
+        if isinstance(event, EpisodeDone):
+            assert torch.equal(event.evaluation_return, expected.evaluation_return)
+            assert all(torch.equal(event.metrics[key], expected.metrics[key]) for key in expected.metrics)
+    for learner, other in ((together.population, apart.population), (together.individual, apart.individual)):
+        for key, value in other.loss.state_dict().items():
+            assert torch.equal(learner.loss.state_dict()[key], value), key
+
+
 def test_the_runs_of_a_fleet_get_bodies_of_their_own() -> None:
     algorithm = small(3)
     events = list(algorithm)

@@ -64,3 +64,13 @@ def test_a_broken_row_is_terminated_and_starts_again_while_the_other_goes_on() -
     torch.testing.assert_close(start, rows["observation"][0, 0], rtol=0, atol=0.02)  # reset noise is U(+-0.005)
     assert not torch.equal(start, rows["next", "observation"][2, 0])
     assert torch.equal(rows["next", "observation"][:, 1], expected["next", "observation"][:, 1])
+
+
+def test_a_sampled_action_is_the_tanh_of_loc_plus_scale_times_the_noise_of_the_generator() -> None:
+    env = HopperMorph(num_runs=2, episode_steps=7, seed=0)
+    policy = make_policy(env, num_cells=(16,))
+    rows = run_episode(env, policy, rng=torch.Generator().manual_seed(4))
+    noise = torch.randn(7, 2, 3, generator=torch.Generator().manual_seed(4))
+    with torch.no_grad():
+        loc, scale = policy.network(rows["observation"], rows["design"])
+    torch.testing.assert_close(rows["action"], (loc + scale * noise).tanh(), rtol=0, atol=1e-6)

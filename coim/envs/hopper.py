@@ -16,8 +16,9 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
+from coim.angles import wrap_angle
 from coim.envs.morph import MorphEnv
-from coim.envs.task import Task, speed_along, wrap_angle
+from coim.envs.task import Task, speed_along
 from coim.envs.walker import ANKLE, shape_leg, shape_torso
 
 HEIGHT, PITCH_ANGLE, FORWARD_VELOCITY = 0, 1, 5  # entries of the observation

@@ -47,6 +47,9 @@ class MorphEnv(EnvBase):
     observation, ``num_broken`` counts it, and its robot stands at its start until the row is reset. No other row
     notices.
 
+    The pitch is wrapped to (-pi, pi], in the observation and in the rewards: its hinge is unbounded and a fallen robot
+    may roll on. Velocities are not clipped, as Gymnasium's walker and hopper do at 10.
+
     Keyword Args:
         num_runs: rows K of the fleet, the environment's batch size ``[K]``.
         task: ``"forward"``, or ``"backward"`` with the sign of the speed turned (Fig. 1, second row).

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coim.angles import wrap_angle
 from coim.envs.morph import MorphEnv
-from coim.envs.task import Task, speed_along, wrap_angle
+from coim.envs.task import Task, speed_along
 
 HEIGHT, PITCH_ANGLE, FORWARD_VELOCITY = -17, -16, -9  # entries of the observation, with or without root x in front
 TORSO, THIGH, KNEE, FOOT = 0.4, 0.45, 0.6, 0.2  # m at xi = 1; KNEE is its height above the sole's axis

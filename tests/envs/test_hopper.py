@@ -84,7 +84,8 @@ def test_free_flight_keeps_the_energy():
         (1.2, 2.0, 0.0, "forward", 3.0),
         (1.2, -2.0, 0.0, "forward", 1.0),
         (1.2, -2.0, 0.0, "backward", 3.0),
-        (0.4, 2.0, 0.0, "forward", 0.3),
+        (0.51, 2.0, 0.0, "forward", 3.0),
+        (0.49, 2.0, 0.0, "forward", 0.3),
         (1.2, 2.0, -0.5, "forward", 2.95),
         (0.4, 0.0, math.pi, "forward", 0.1 - 0.1 * math.pi),
         (0.4, 0.0, 4 * math.pi - 0.5, "forward", 0.05),  # a pitch that winds up costs no more than its direction

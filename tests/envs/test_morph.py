@@ -204,6 +204,12 @@ def test_the_same_seed_gives_the_same_bits_and_rows_differ(body):
     assert not first[:, 0].equal(first[:, 1])
 
 
+@BODIES
+def test_no_two_rows_of_any_seeds_start_alike(body):
+    starts = torch.cat([body(num_runs=3, seed=seed).reset()["observation"] for seed in range(3)])
+    assert len(starts.unique(dim=0)) == 9
+
+
 def test_set_seed_begins_the_noise_anew():
     env = HopperMorph(num_runs=2, seed=0)
     first, second = env.reset()["observation"], env.reset()["observation"]
@@ -278,6 +284,20 @@ def test_a_broken_row_is_terminated_counted_finite_and_alone(body, velocity):
     assert env.num_broken.tolist() == [0, 1, 0]
 
 
+def test_every_break_is_counted_and_answered_with_the_last_observation_of_the_row_itself():
+    env = HopperMorph(num_runs=2, seed=0)
+    env.reset()
+    for times, action in enumerate(some_actions(env, 3), start=1):
+        observation, _, _ = env.advance(action)
+        seen = observation.clone()
+        observation.zero_()  # it is the caller's own
+        env.simulations.qvel[0, 0] = math.nan
+        broken, _, _ = env.advance(action)
+        assert broken[0].equal(seen[0])
+        assert env.num_broken.tolist() == [times, 0]
+        env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+
+
 def test_a_rollout_goes_on_after_a_broken_row():
     env = HopperMorph(num_runs=2, seed=0)
     designs = some_designs(env)
@@ -302,6 +322,16 @@ def test_place_takes_up_a_trajectory_at_any_step(body):
         predicted, predicted_reward, _ = oracle.advance(action)
         torch.testing.assert_close(predicted, observation, rtol=1e-3, atol=2e-3)
         torch.testing.assert_close(predicted_reward, reward, rtol=1e-3, atol=1e-3)
+
+
+def test_place_begins_a_new_count_of_steps():
+    env = HopperMorph(num_runs=1, seed=0, episode_steps=3)
+    td = env.reset()
+    for action in some_actions(env, 2):
+        td = env.step(td.set("action", action))["next"].exclude("reward")
+    env.place(td["observation"], td["design"])
+    truncated = [env.step(td.set("action", action))["next", "truncated"].item() for action in some_actions(env, 3)]
+    assert truncated == [False, False, True]
 
 
 def test_place_refuses_what_is_no_state():

@@ -112,7 +112,8 @@ def test_free_flight_keeps_the_energy():
         (1.2, 2.0, 0.0, "forward", 0.3),
         (1.2, -2.0, 0.0, "forward", 0.1),
         (1.2, -2.0, 0.0, "backward", 0.3),
-        (0.7, 2.0, 0.0, "forward", 0.0),
+        (0.81, 2.0, 0.0, "forward", 0.3),
+        (0.79, 2.0, 0.0, "forward", 0.0),
         (1.2, 2.0, -0.5, "forward", 0.295),
         (0.7, 2.0, math.pi, "forward", -0.01 * math.pi),
         (0.7, 2.0, 2 * math.pi + 0.5, "forward", -0.005),  # a pitch that winds up costs no more than its direction

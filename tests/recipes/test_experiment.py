@@ -53,6 +53,19 @@ def test_the_same_seed_repeats_and_another_does_not(tmp_path: Path) -> None:
     assert a != c
 
 
+def test_the_baseline_differs_from_the_method_by_imagination_alone(tmp_path: Path) -> None:
+    for designs in ("known", "none"):
+        run(tmp_path / designs, "--designs", designs, "--quiet")
+    ours, theirs = (read(tmp_path / designs / "evaluations.csv") for designs in ("known", "none"))
+    # Until the population has learnt for the first time, nothing that was imagined reaches anything.
+    assert ours[0]["training_return"] == theirs[0]["training_return"]
+    assert ours[0]["return"] == theirs[0]["return"]
+    assert ours[1]["return"] != theirs[1]["return"]
+    for ours_too, theirs_too in zip(ours, theirs, strict=True):
+        if ours_too["kind"] != "optimised":
+            assert [ours_too[f"xi_{i}"] for i in range(1, 5)] == [theirs_too[f"xi_{i}"] for i in range(1, 5)]
+
+
 def test_runs_in_lock_step_have_a_row_each(tmp_path: Path) -> None:
     run(tmp_path / "fleet", "--num-runs", "3", "--designs", "noisy", "--task", "backward", "--quiet")
     designs = read(tmp_path / "fleet" / "designs.csv")

@@ -1,0 +1,61 @@
+"""What a run takes of the machine it finds: threads, memory, device."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+
+import torch
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+KEPT = 1 << 30  # bytes
+
+
+def available_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def checked_device(name: str) -> torch.device:
+    """The device, or a sentence that says why it cannot be used."""
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device {name!r} cannot be used here ({reason}); try --device cpu") from None
+    return device
+
+
+def prepare(threads: int, device: torch.device) -> bool:
+    """Set this process up for training.
+
+    The networks are so small that a second thread inside of a product gains little, while two learners side by side
+    gain nearly twice: every learner gets one thread. Threads that wait for each other inside of products also collapse
+    when a second process wants the same cores; threads that do not wait only share them.
+
+    Args:
+        threads: that may be busy at once.
+        device: of the networks.
+
+    Returns:
+        Whether to train the learners side by side.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it reports every storage that it allocates
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    return threads > 1 and device.type == "cpu"
+
+
+def keep_freed_memory() -> None:
+    """Keep the allocator from giving activations back to the system after every product (glibc; elsewhere nothing).
+
+    By default it maps and unmaps each block above 128 KB, and the page faults cost as much as the arithmetic.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    mallopt(M_MMAP_THRESHOLD, KEPT)
+    mallopt(M_TRIM_THRESHOLD, KEPT)
