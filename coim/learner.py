@@ -22,6 +22,7 @@ from torchrl.objectives import SoftUpdate
 
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
+from coim.models.scaling import InputScaling
 from coim.models.stacked import StackedMLP
 from coim.objectives.functional import mixing_weights
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
@@ -51,7 +52,8 @@ class SACLearner:
         optimiser: Adam over the flat buffer of all weights.
 
     Raises:
-        ValueError: if ``precision`` is unknown, a number is out of its range, or ``num_runs`` is not the networks'.
+        ValueError: if ``precision`` is unknown, a number is out of its range, ``num_runs`` is not the networks', or
+            policy and critics scale their inputs differently.
 
     Note:
         Moving the modules to another device or dtype afterwards would part them from the flat buffers.
@@ -84,6 +86,8 @@ class SACLearner:
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
         if not 0 < tau <= 1:
             raise ValueError(f"tau={tau} is outside (0, 1]; Sec. 6.1 has 0.005")
+        if not same_scaling(policy.network.scaling, qvalue.module.scaling):
+            raise ValueError("policy and qvalue scale their inputs differently; make both for the same environment")
         self.policy, self.qvalue = policy, qvalue
         self.loss = CoImSACLoss(policy, qvalue, alpha=alpha, gamma=gamma, mix=mix, num_runs=num_runs)
         SoftUpdate(self.loss, tau=tau)  # starts the targets at the critics, and tells TorchRL that they are cared for
@@ -173,14 +177,22 @@ class SACLearner:
         def by_run(x: Tensor) -> Tensor:
             return x.reshape(len(x), -1, runs, x.shape[-1]).transpose(1, 2).contiguous()
 
+        def scaled(rows: TensorDictBase) -> tuple[Tensor, Tensor]:
+            """Observation and design as the networks' first layers see them."""
+            scaling = self.policy.network.scaling
+            inputs = rows["observation"], batches["design"]
+            observation, design = inputs if scaling is None else scaling(*inputs)
+            return by_run(observation), by_run(design)
+
         flags = by_run(imagined).squeeze(-1)
         weight = [mixing_weights(flag.mT, self.loss.mix, dtype=noise.dtype).mT for flag in flags]
         after = batches["next"]
+        observation, design = scaled(batches)
         return Batch(
-            observation=by_run(batches["observation"]),
-            design=by_run(batches["design"]),
+            observation=observation,
+            design=design,
             action=by_run(batches["action"]),
-            next_observation=by_run(after["observation"]),
+            next_observation=scaled(after)[0],
             reward=by_run(after["reward"]).squeeze(-1),
             terminated=by_run(after["terminated"]).squeeze(-1),
             noise=by_run(noise),
@@ -211,6 +223,13 @@ class SACLearner:
             else:
                 parts.extend(critic[i] for g in found for critic in g.critics)
         self._gradient.copy_(torch.cat([part.reshape(-1) for part in parts]))
+
+
+def same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
+    """Whether two networks see the same numbers."""
+    if one is None or other is None:
+        return one is other
+    return all(torch.equal(a, b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
 
 
 def share_storage(tensors: Sequence[Tensor]) -> Tensor:

@@ -79,6 +79,7 @@ class HalfCheetahMorph(MorphEnv):
     DESIGN_BOUNDS = (0.8, 2.0)
     FRAME_SKIP = 5
     RESET_NOISE = 0.1
+    OBSERVATION_SCALE = (0.2, 1.5, *[0.3] * 6, 0.7, 0.7, 1.5, *[6.0] * 6)  # m, rad, m/s, rad/s
     SEGMENT_LENGTHS: ClassVar[tuple[float, ...]] = (0.29, 0.3, 0.188, 0.266, 0.212, 0.14)  # m, as drawn
     # The first five designs of the predecessor (Luck et al. 2019), the same for every run (Sec. 6.1).
     FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]] = (

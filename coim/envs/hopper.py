@@ -68,6 +68,7 @@ class HopperMorph(MorphEnv):
     DESIGN_BOUNDS = (0.5, 2.0)
     FRAME_SKIP = 4
     RESET_NOISE = 0.005
+    OBSERVATION_SCALE = (0.3, 1.5, 1.0, 1.0, 0.5, 0.5, 0.7, *[2.5] * 4)  # m, rad, m/s, rad/s
     # The unit body and four draws from the uniform distribution, kept so that every run starts with the same five (Sec.
     # 6.1).
     FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]] = (

@@ -73,6 +73,7 @@ class MorphEnv(EnvBase):
     DESIGN_BOUNDS: ClassVar[tuple[float, float]]
     FRAME_SKIP: ClassVar[int]  # simulation steps in an environment step
     RESET_NOISE: ClassVar[float]
+    OBSERVATION_SCALE: ClassVar[tuple[float, ...]]  # standard deviations under random actions at xi = 1, rounded
 
     _first_position = 1  # of qpos in the observation: the root's x is left out
 
@@ -151,6 +152,12 @@ class MorphEnv(EnvBase):
         """The designs that can be built, ``[D]``: ``project`` clips to them, ``rand`` draws from them."""
         low, high = self.DESIGN_BOUNDS
         return Bounded(low, high, shape=(self.DESIGN_SIZE,), dtype=torch.float32, device=self.device)
+
+    @property
+    def observation_scale(self) -> Tensor:
+        """Typical spread of each observation, ``[S]``: networks divide by it."""
+        scale = self.OBSERVATION_SCALE[-self.observation_spec["observation"].shape[-1] :]  # without root x: the rest
+        return torch.tensor(scale, device=self.device)
 
     @property
     def angle_indices(self) -> tuple[int, ...]:

@@ -75,6 +75,8 @@ class WalkerMorph(MorphEnv):
     DESIGN_BOUNDS = (0.5, 2.0)
     FRAME_SKIP = 4
     RESET_NOISE = 0.005
+    # Both legs alike; the distance travelled by what a walking body covers, random actions stay within 1 m.
+    OBSERVATION_SCALE = (5.0, 0.25, 1.5, *[0.9, 0.9, 0.6] * 2, 1.1, 1.3, 8.0, *[9.5, 6.0, 15.0] * 2)
     # The unit body and four draws from the uniform distribution, kept so that every run starts with the same five (Sec.
     # 6.1).
     FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]] = (

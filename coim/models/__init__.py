@@ -4,10 +4,12 @@ from .ensemble import GaussianEnsemble
 from .normaliser import RunningNormaliser
 from .policy import Policy, PolicyNetwork, make_policy
 from .qvalue import QValue, QValueNetwork, make_qvalue
+from .scaling import InputScaling
 from .stacked import StackedLinear, StackedMLP, select_run
 
 __all__ = [
     "GaussianEnsemble",
+    "InputScaling",
     "Policy",
     "PolicyNetwork",
     "QValue",

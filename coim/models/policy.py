@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
+from .scaling import InputScaling
 from .stacked import StackedMLP
 
 LOG_SCALE_RANGE = (-20.0, 2.0)  # rlkit's LOG_SIG_MIN, LOG_SIG_MAX
@@ -31,6 +32,7 @@ class PolicyNetwork(nn.Module):
         num_actions: ``A``.
         num_cells: units of each hidden layer.
         num_runs: ``K``, or None for a single run.
+        scaling: of the inputs; None takes them as they are.
     """
 
     def __init__(
@@ -41,8 +43,10 @@ class PolicyNetwork(nn.Module):
         *,
         num_cells: Sequence[int] = (200, 200, 200),
         num_runs: int | None = None,
+        scaling: InputScaling | None = None,
     ) -> None:
         super().__init__()
+        self.scaling = scaling
         self.mlp = StackedMLP(num_observations + num_designs, 2 * num_actions, num_cells, num_runs=num_runs)
 
     def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,6 +59,8 @@ class PolicyNetwork(nn.Module):
         Returns:
             ``loc`` and ``scale``, each ``[*B, (K,) A]``; ``scale`` lies in ``exp(LOG_SCALE_RANGE)``.
         """
+        if self.scaling is not None:
+            observation, design = self.scaling(observation, design)
         loc, log_scale = self.mlp(observation, design).chunk(2, -1)
         return loc, log_scale.clamp(*LOG_SCALE_RANGE).exp()
 
@@ -99,7 +105,7 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
 
     Args:
         env: anything with ``observation_spec["observation"]``, ``design_spec`` and ``action_spec``; only the sizes of
-            their last dimensions and the action's bounds are read.
+            their last dimensions and the bounds are read, and ``observation_scale`` if there is one.
         num_cells: units of each hidden layer.
         num_runs: ``K`` independent policies in one; the last batch dimension of their input is then the run axis.
 
@@ -121,5 +127,6 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
         env.action_spec.shape[-1],
         num_cells=num_cells,
         num_runs=num_runs,
+        scaling=InputScaling.for_env(env),
     )
     return Policy(network)

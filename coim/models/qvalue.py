@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from .scaling import InputScaling
 from .stacked import StackedMLP
 
 
@@ -24,6 +25,7 @@ class QValueNetwork(nn.Module):
         num_critics: ``N``, critics with weights of their own.
         num_cells: units of each hidden layer.
         num_runs: ``K``, or None for a single run.
+        scaling: of the inputs; None takes them as they are.
     """
 
     def __init__(
@@ -35,8 +37,10 @@ class QValueNetwork(nn.Module):
         num_critics: int = 2,
         num_cells: Sequence[int] = (200, 200, 200),
         num_runs: int | None = None,
+        scaling: InputScaling | None = None,
     ) -> None:
         super().__init__()
+        self.scaling = scaling
         size = num_observations + num_actions + num_designs
         self.mlp = StackedMLP(size, 1, num_cells, num_runs=num_runs, num_copies=num_critics)
 
@@ -51,6 +55,8 @@ class QValueNetwork(nn.Module):
         Returns:
             ``[*B, (K,) N]``.
         """
+        if self.scaling is not None:
+            observation, design = self.scaling(observation, design)
         return self.mlp(observation, action, design).squeeze(-1)
 
 
@@ -83,7 +89,7 @@ def make_qvalue(
 
     Args:
         env: anything with ``observation_spec["observation"]``, ``design_spec`` and ``action_spec``; only the sizes of
-            their last dimensions are read.
+            their last dimensions and the design's bounds are read, and ``observation_scale`` if there is one.
         num_critics: ``N``; two in the double-Q approach of Sec. 4.
         num_cells: units of each hidden layer.
         num_runs: ``K`` independent sets of critics in one; the last batch dimension of their input is then the run
@@ -102,5 +108,6 @@ def make_qvalue(
         num_critics=num_critics,
         num_cells=num_cells,
         num_runs=num_runs,
+        scaling=InputScaling.for_env(env),
     )
     return QValue(network)

@@ -1,0 +1,62 @@
+"""Bringing the inputs of policy and critics to one magnitude.
+
+Shapes: ``B`` batch, ``S`` state, ``D`` design.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+
+class InputScaling(nn.Module):
+    """Observations over their typical spread, designs from their bounds to [-1, 1].
+
+    Joint velocities are twenty times joint angles: without scaling a network sees little else, and on Half-Cheetah a
+    controller takes ten times as many episodes (docs/results). The spreads are constants of the body, not statistics of
+    what was seen: they are the same for every arm, run and network, targets included, and nothing has to be kept up.
+
+    Args:
+        observation_scale: typical spread of each entry, ``[S]``.
+        low: least design, ``[D]``.
+        high: greatest design, ``[D]``.
+
+    Raises:
+        ValueError: if a spread or a range is not positive.
+
+    Example:
+        >>> scaling = InputScaling(torch.tensor([0.5, 10.0]), torch.tensor([0.8]), torch.tensor([2.0]))
+        >>> observation, design = scaling(torch.tensor([1.0, 5.0]), torch.tensor([2.0]))
+        >>> observation, design
+        (tensor([2.0000, 0.5000]), tensor([1.]))
+    """
+
+    observation_scale: Tensor
+    design_centre: Tensor
+    design_reach: Tensor
+
+    def __init__(self, observation_scale: Tensor, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        if not (observation_scale > 0).all():
+            raise ValueError(
+                f"observation scales {observation_scale.tolist()} must be positive; 1 leaves an entry alone"
+            )
+        if not (high > low).all():
+            raise ValueError(f"design bounds {low.tolist()} and {high.tolist()} must leave a range in every entry")
+        self.register_buffer("observation_scale", observation_scale.clone())
+        self.register_buffer("design_centre", (high + low) / 2)
+        self.register_buffer("design_reach", (high - low) / 2)
+
+    @classmethod
+    def for_env(cls, env: EnvBase) -> InputScaling:
+        """The scaling of an environment: its ``observation_scale`` (none: all ones) and its ``design_spec``."""
+        scale = getattr(env, "observation_scale", None)
+        if scale is None:
+            scale = torch.ones(env.observation_spec["observation"].shape[-1])
+        bounds = env.design_spec.space
+        return cls(scale, bounds.low, bounds.high)
+
+    def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
+        """Scale both, ``[*B, S]`` and ``[*B, D]``."""
+        return observation / self.observation_scale, (design - self.design_centre) / self.design_reach
