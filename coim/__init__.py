@@ -3,8 +3,9 @@
 Everything that is public, in one flat list. Importing it starts nothing, reads nothing and prints nothing.
 """
 
-from coim.buffers import Buffers, TransitionBuffer, sample_batches, sample_mixed, transition_rows
-from coim.coadaptation import CoAdaptation, DesignChosen, DesignDone, EpisodeDone, Event
+from coim.batches import sample_batches, sample_mixed, sample_mixture
+from coim.buffers import Buffers, TransitionBuffer, transition_rows
+from coim.coadaptation import CoAdaptation
 from coim.designs import (
     DesignGenerator,
     DesignSearch,
@@ -17,6 +18,7 @@ from coim.designs import (
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, WorldModelEnv
 from coim.episode import run_episode
+from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
 from coim.imagination import imagine
 from coim.learner import SACLearner
 from coim.models import GaussianEnsemble, Policy, QValue, StackedMLP, make_policy, make_qvalue, select_run
@@ -59,6 +61,7 @@ __all__ = [
     "run_episode",
     "sample_batches",
     "sample_mixed",
+    "sample_mixture",
     "select_run",
     "transition_rows",
 ]

@@ -1,17 +1,17 @@
-"""The four replay buffers of Algorithm 1, their common schema, and the exact mixture of real and imagined rows.
+"""The four replay buffers of Algorithm 1 and their common schema.
 
-Shapes: ``T`` time steps (rows of a buffer), ``B`` rows of a batch, ``K`` runs, ``S`` state, ``A`` action, ``D`` design.
+Shapes: ``T`` time steps (rows of a buffer), ``B`` any batch, ``K`` runs, ``S`` state, ``A`` action, ``D`` design.
 
 A buffer is TorchRL's, with one element per time step. An element is ``[K]``-batched: a sample of B elements is
 ``[B, K]`` and a run only ever sees its own rows. The same time steps are drawn for all runs.
 
 References:
-    Co-Imagination of Behaviour and Morphology of Agents: Sec. 5 (80 % real, 20 % imagined), Algorithm 1.
+    Co-Imagination of Behaviour and Morphology of Agents: Sec. 5, Algorithm 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -69,8 +69,8 @@ class TransitionBuffer(TensorDictReplayBuffer):
         >>> buffer = TransitionBuffer(100, num_runs=2, seed=0)
         >>> row = torch.zeros(5, 2, 1)
         >>> _ = buffer.extend(TensorDict({key: row for key in ROW_KEYS}, [5, 2]))
-        >>> sample_batches(buffer, batch_size=256, num_batches=3).shape
-        torch.Size([3, 256, 2])
+        >>> buffer.sample(256).shape
+        torch.Size([256, 2])
     """
 
     def __init__(self, capacity: int, *, num_runs: int = 1, seed: int, device: torch.device | str = "cpu") -> None:
@@ -189,124 +189,3 @@ class Buffers:
         """Fill the buffers as those that :meth:`state_dict` was read from."""
         for field in fields(self):
             getattr(self, field.name).load_state_dict(state_dict[field.name])
-
-
-def sample_batches(
-    buffer: TensorDictReplayBuffer,
-    *,
-    batch_size: int = 256,
-    num_batches: int = 1,
-    rng: torch.Generator | None = None,
-) -> TensorDict:
-    """Draw many batches in one call, uniformly and with replacement.
-
-    Args:
-        buffer: elements of batch size ``[K]``.
-        batch_size: B, elements per batch.
-        num_batches: batches drawn at once; fifty cost hardly more than one.
-        rng: draws the rows, on the buffer's device; None takes the buffer's own generator. Readers that run at the same
-            time need generators of their own, or who comes first decides what each of them gets.
-
-    Returns:
-        ``[num_batches, B, K]`` rows without TorchRL's ``index``.
-
-    Raises:
-        ValueError: if the buffer is empty or a number is below 1.
-    """
-    if min(batch_size, num_batches) < 1:
-        raise ValueError(f"{num_batches} batches of {batch_size} rows: both numbers must be at least 1")
-    if len(buffer) == 0:
-        raise ValueError(f"{batch_size} rows are wanted of an empty buffer; extend() it with transitions first")
-    if rng is None:
-        rows = buffer.sample(num_batches * batch_size)
-    else:
-        rows = buffer[torch.randint(len(buffer), (num_batches * batch_size,), generator=rng, device=rng.device)]
-    return rows.exclude("index").unflatten(0, (num_batches, batch_size))
-
-
-def sample_mixture(
-    sources: Sequence[tuple[TensorDictReplayBuffer, int]],
-    num_batches: int = 1,
-    *,
-    imagined: TensorDictReplayBuffer | None = None,
-    rng: torch.Generator | None = None,
-) -> TensorDict:
-    """Draw batches that are put together from several buffers, each with its exact number of rows.
-
-    Args:
-        sources: buffers and the rows that each gives to a batch, in the order in which they appear there. A buffer that
-            gives 0 rows may be empty.
-        num_batches: batches drawn at once.
-        imagined: which of the buffers holds imagined rows, Replay_Art; None writes no ``imagined``.
-        rng: as for :func:`sample_batches`.
-
-    Returns:
-        ``[num_batches, B, K]`` rows, B the sum of all rows, with ``imagined`` ``[num_batches, B, K, 1]`` written.
-
-    Raises:
-        ValueError: if a buffer that is drawn from is empty, or there are no rows to draw.
-
-    Example:
-        >>> one, two = (TransitionBuffer(8, seed=0) for _ in range(2))
-        >>> rows = TensorDict({key: torch.zeros(8, 1, 1) for key in ROW_KEYS}, [8, 1])
-        >>> _ = one.extend(rows), two.extend(rows)
-        >>> sample_mixture([(one, 2), (two, 1)], imagined=two)["imagined"].flatten()
-        tensor([False, False,  True])
-    """
-    parts = []
-    for buffer, num_rows in sources:
-        if num_rows == 0:
-            continue
-        rows = sample_batches(buffer, batch_size=num_rows, num_batches=num_batches, rng=rng)
-        if imagined is not None:
-            flag = torch.full((*rows.batch_size, 1), buffer is imagined, device=rows["design"].device)
-            rows.set("imagined", flag)
-        parts.append(rows)
-    if not parts:
-        raise ValueError("a batch of 0 rows is asked for; let one of its sources give 1 or more")
-    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
-
-
-def sample_mixed(
-    real: TensorDictReplayBuffer,
-    imagined: TensorDictReplayBuffer,
-    *,
-    batch_size: int = 256,
-    share: float = 0.2,
-    num_batches: int = 1,
-) -> TensorDict:
-    """Draw the population's batches: 80 % real, 20 % imagined, exactly (Sec. 5).
-
-    With the defaults each batch is 205 real rows and then 51 imagined ones. (TorchRL's ``ReplayBufferEnsemble`` draws
-    the buffers at random, so that its shares hold on average only.)
-
-    Args:
-        real: Replay_Pop.
-        imagined: Replay_Art.
-        batch_size: B, rows per batch.
-        share: of imagined rows, in [0, 1]; they are the last ``round(share * B)``.
-        num_batches: batches drawn at once.
-
-    Returns:
-        ``[num_batches, B, K]`` rows with ``imagined`` ``[num_batches, B, K, 1]`` written.
-
-    Raises:
-        ValueError: if a buffer that is drawn from is empty, the share leaves [0, 1], or the batch is too small to hold
-            a row of each.
-    """
-    num_imagined = _rows_of_share(batch_size, share)
-    sources = [(real, batch_size - num_imagined), (imagined, num_imagined)]
-    return sample_mixture(sources, num_batches, imagined=imagined)
-
-
-def _rows_of_share(batch_size: int, share: float) -> int:
-    """Return how many rows of a batch the share stands for."""
-    if not 0.0 <= share <= 1.0:
-        raise ValueError(f"the share is {share}, it must be in [0, 1]: 0.2 is one imagined row in five")
-    rows = round(share * batch_size)
-    if 0.0 < share < 1.0 and rows in (0, batch_size):
-        raise ValueError(
-            f"a batch of {batch_size} rows is smaller than its parts: a share of {share} makes it "
-            f"{batch_size - rows} + {rows} rows; enlarge the batch, or set the share to 0 or 1"
-        )
-    return rows

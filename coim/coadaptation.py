@@ -15,93 +15,26 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from coim.buffers import Buffers, sample_mixture
+from coim.batches import BatchParts, batch_parts, sample_mixture
+from coim.buffers import Buffers
 from coim.designs import DesignGenerator, DesignSearch, RandomDesigns
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
 from coim.episode import run_episode
+from coim.events import DesignChosen, DesignDone, EpisodeDone, Event, Kind
 from coim.imagination import imagine
 from coim.learner import SACLearner
 from coim.models.stacked import select_run
 from coim.objectives.design import DesignValue
 
-Kind = Literal["first", "optimised", "random"]
-
 UPDATES_PER_SAMPLE = 50  # batches drawn in one call: the replay's fixed cost is paid once for all of them
-
-
-@dataclass(frozen=True)
-class DesignChosen:
-    """A body is about to be built.
-
-    Attributes:
-        index: 0 for the first.
-        kind: one of the first designs, the optimum of Eq. 5, or a random one.
-        design: ``[K, D]``.
-        predicted: Eq. 5 at this design before anything is learnt on it, ``[K]``; None while there is no start state.
-    """
-
-    index: int
-    kind: Kind
-    design: Tensor
-    predicted: Tensor | None
-
-
-@dataclass(frozen=True)
-class EpisodeDone:
-    """One training episode, the updates after it, and one evaluation episode.
-
-    Attributes:
-        index: of the design.
-        kind: of the design.
-        episode: 0 for the design's first.
-        design: ``[K, D]``.
-        training_return: undiscounted, of the sampled actions, ``[K]``.
-        evaluation_return: undiscounted, of the deterministic individual policy, ``[K]``.
-        env_steps: training steps of one run so far; evaluation steps are not counted, nothing is learnt from them.
-        imagined: rows in Replay_Art of one run.
-        metrics: means over the updates, each ``[K]``: losses, entropies, ``model_error``.
-        seconds: wall-clock by part; parts that run side by side overlap, ``episode`` is the whole.
-    """
-
-    index: int
-    kind: Kind
-    episode: int
-    design: Tensor
-    training_return: Tensor
-    evaluation_return: Tensor
-    env_steps: int
-    imagined: int
-    metrics: dict[str, Tensor]
-    seconds: dict[str, float]
-
-
-@dataclass(frozen=True)
-class DesignDone:
-    """All episodes of a design are over.
-
-    Attributes:
-        index: of the design.
-        kind: of the design.
-        design: ``[K, D]``.
-        best_return: highest evaluation return, ``[K]``: the figure of merit of the paper's Fig. 1.
-    """
-
-    index: int
-    kind: Kind
-    design: Tensor
-    best_return: Tensor
-
-
-Event = DesignChosen | EpisodeDone | DesignDone
 
 
 Means = dict[str, Tensor]
@@ -145,6 +78,7 @@ class CoAdaptation:
         imagined_rows: rows in Replay_Art after a refresh; None takes one for each imagined row of the coming updates.
         side_by_side: train the individual learner in one thread while another trains the population's and the ensemble.
             They do not depend on each other, and the result is the same to the last bit.
+        precision: of the networks' products in Eq. 5; each learner has its own.
         seed: seeds the generators of the actions, the imagination and the random designs.
 
     Raises:
@@ -182,6 +116,7 @@ class CoAdaptation:
         num_start_states: int = 36,
         imagined_rows: int | None = None,
         side_by_side: bool = False,
+        precision: Literal["float32", "bfloat16"] = "float32",
         seed: int = 0,
     ) -> None:
         if (dream is None) != (generator is None):
@@ -227,6 +162,7 @@ class CoAdaptation:
             name: torch.Generator(env.device or "cpu").manual_seed(int(torch.randint(2**62, (), generator=seeds)))
             for name in ("actions", "dream", "designs", "individual", "population", "model")
         }
+        self.precision = precision
         self._beside = ThreadPoolExecutor(1, "coim-population") if side_by_side else None
 
     def __iter__(self) -> Iterator[Event]:
@@ -357,53 +293,16 @@ class CoAdaptation:
         policy, qvalue = self.population.policy, self.population.qvalue
         runs = self.env.batch_size.numel()
         if runs == 1:
-            return [DesignValue(policy, qvalue, states[:, 0])]
-        return [DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k]) for k in range(runs)]
+            return [DesignValue(policy, qvalue, states[:, 0], precision=self.precision)]
+        return [
+            DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k], precision=self.precision)
+            for k in range(runs)
+        ]
 
     def _predict(self, design: Tensor) -> Tensor | None:
         if len(self.buffers.s0) == 0:
             return None
         return torch.stack([fitness(row.unsqueeze(0))[0] for fitness, row in zip(self._fitness(), design)])
-
-
-@dataclass(frozen=True)
-class BatchParts:
-    """Rows of one batch by where they come from."""
-
-    own: int
-    other: int
-    imagined: int
-
-
-def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -> BatchParts:
-    """Whole rows for shares of a batch.
-
-    Args:
-        batch_size: rows in all.
-        imagined: share from Replay_Art, in [0, 1].
-        other: share from a second real buffer, in [0, 1].
-
-    Raises:
-        ValueError: if a share leaves [0, 1], the shares need more rows than there are, or one is too small for a row.
-
-    Example:
-        >>> batch_parts(256, imagined=0.2)
-        BatchParts(own=205, other=0, imagined=51)
-    """
-    for name, share in (("imagined", imagined), ("other", other)):
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(f"the {name} share is {share}, it must lie in [0, 1]")
-    rows = round(batch_size * imagined), round(batch_size * other)
-    own = batch_size - sum(rows)
-    if own < 0:
-        raise ValueError(f"shares {imagined} and {other} of a batch of {batch_size} rows need {sum(rows)}; lower them")
-    wanted = (1 - imagined - other, own), (other, rows[1]), (imagined, rows[0])
-    if any(share > 1e-9 and not count for share, count in wanted):
-        raise ValueError(
-            f"a batch of {batch_size} rows is smaller than its parts: shares {imagined} and {other} make it {own} + "
-            f"{rows[1]} + {rows[0]} rows; enlarge the batch, or set a share to 0"
-        )
-    return BatchParts(own=own, other=rows[1], imagined=rows[0])
 
 
 def episode_return(rows: TensorDictBase) -> Tensor:

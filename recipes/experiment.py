@@ -18,6 +18,7 @@ from coim import (
     EpisodeDone,
     Event,
     GaussianEnsemble,
+    GradientSearch,
     KnownDesigns,
     MorphEnv,
     NoisyDesigns,
@@ -28,8 +29,8 @@ from coim import (
     make_policy,
     make_qvalue,
 )
-from coim.coadaptation import batch_parts
-from coim.designs import DesignGenerator
+from coim.batches import batch_parts
+from coim.designs import DesignGenerator, DesignSearch
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.pictures import draw_run
 from recipes.progress import Progress
@@ -118,6 +119,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
             lr=settings.lr,
             mix=settings.mix,
             num_runs=stacked,
+            precision=settings.precision,
             seed=next(seeds),
         )
 
@@ -132,7 +134,13 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
             predict=settings.predict,
             num_runs=stacked,
         ).to(device)
-        dynamics = DynamicsLearner(ensemble, lr=settings.model_lr, weight_decay=settings.weight_decay, num_runs=stacked)
+        dynamics = DynamicsLearner(
+            ensemble,
+            lr=settings.model_lr,
+            weight_decay=settings.weight_decay,
+            num_runs=stacked,
+            precision=settings.precision,
+        )
         dream = WorldModelEnv(ensemble, env, batch_size=env.batch_size)
     return CoAdaptation(
         env,
@@ -140,12 +148,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         population=population,
         individual=individual,
         buffers=make_buffers(env, settings, seed=next(seeds)),
-        search=ParticleSwarm(
-            env.design_spec,
-            num_particles=settings.num_particles,
-            num_iterations=settings.num_iterations,
-            seed=next(seeds),
-        ),
+        search=make_search(env, settings, seed=next(seeds)),
         first_designs=torch.tensor(body.FIRST_DESIGNS, device=device),
         dynamics=dynamics,
         dream=dream,
@@ -162,6 +165,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         individual_imagined_share=settings.individual_imagined_share,
         num_start_states=settings.num_start_states,
         side_by_side=side_by_side,
+        precision=settings.precision,
         seed=next(seeds),
     )
 
@@ -173,6 +177,19 @@ def make_generator(env: MorphEnv, settings: Settings) -> DesignGenerator | None:
     if settings.designs == "noisy":
         return NoisyDesigns(env.design_spec, sigma=settings.sigma)
     return KnownDesigns() if settings.designs == "known" else RandomDesigns(env.design_spec)
+
+
+def make_search(env: MorphEnv, settings: Settings, *, seed: int) -> DesignSearch:
+    """What maximises Eq. 5, by its name on the command line."""
+    if settings.search == "gradient":
+        return GradientSearch(env.design_spec, seed=seed)
+    return ParticleSwarm(
+        env.design_spec,
+        num_particles=settings.num_particles,
+        num_iterations=settings.num_iterations,
+        bounds=settings.swarm_bounds,
+        seed=seed,
+    )
 
 
 def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:

@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TextIO
 
-from coim.coadaptation import DesignChosen, DesignDone, EpisodeDone
+from coim import DesignChosen, DesignDone, EpisodeDone
 
 
 class Progress:

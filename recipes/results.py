@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from coim.coadaptation import DesignChosen, DesignDone, EpisodeDone
+from coim import DesignChosen, DesignDone, EpisodeDone
 from recipes.settings import Settings
 
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")

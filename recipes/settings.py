@@ -82,14 +82,20 @@ class Settings:
     """What the ensemble's Gaussian is over: the change of the observation, or the next one (Eq. 6 as printed)."""
 
     # -- design search ------------------------------------------------------------------------------------------------
+    search: Literal["swarm", "gradient"] = "swarm"
+    """What maximises Eq. 5: a particle swarm (Sec. 4), or gradient ascent through the critics from many starts."""
     num_particles: int = 700
-    """Particles of the swarm that maximises Eq. 5."""
+    """Particles of the swarm."""
     num_iterations: int = 250
     """Iterations of the swarm."""
+    swarm_bounds: Literal["nearest", "periodic"] = "nearest"
+    """What becomes of a particle that leaves the bounds: clipped, or back in on the other side (the predecessor's)."""
     num_start_states: int = 36
     """Start states that Eq. 5 averages over."""
 
     # -- this machine -------------------------------------------------------------------------------------------------
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the networks' products; weights, moments, targets and losses stay float32."""
     device: str = "cpu"
     """Where the networks live: cpu, cuda, cuda:1, ..."""
     threads: int = 0

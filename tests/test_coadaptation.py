@@ -24,7 +24,7 @@ from coim import (
     make_policy,
     make_qvalue,
 )
-from coim.coadaptation import BatchParts, batch_parts
+from coim.batches import BatchParts
 
 STEPS = 12
 
@@ -221,8 +221,3 @@ def test_a_caller_can_stop_at_any_event() -> None:
 def test_bad_settings_get_a_sentence_before_anything_is_computed(settings: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         small(**settings)
-
-
-def test_batch_parts_of_the_paper() -> None:
-    assert batch_parts(256, imagined=0.2) == BatchParts(own=205, other=0, imagined=51)
-    assert batch_parts(256, other=0.1) == BatchParts(own=230, other=26, imagined=0)

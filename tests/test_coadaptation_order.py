@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from test_coadaptation import STEPS, small
 
 from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation
-from coim.coadaptation import batch_parts
+from coim.batches import batch_parts
 
 
 def traced(algorithm: CoAdaptation, monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -126,8 +126,8 @@ def test_each_run_chooses_its_body_by_the_population_and_its_own_start_states(
     asked: list[TensorDict] = []
 
     class Recorded(DesignValue):
-        def __init__(self, policy: Any, qvalue: Any, start_states: TensorDict) -> None:
-            super().__init__(policy, qvalue, start_states)
+        def __init__(self, policy: Any, qvalue: Any, start_states: TensorDict, **kwargs: Any) -> None:
+            super().__init__(policy, qvalue, start_states, **kwargs)
             asked.append(start_states)
 
     events = iter(algorithm)

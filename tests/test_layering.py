@@ -16,8 +16,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 # Import only from a lower rank, or from your own room. The rooms of rank 1 do not know each other; rank 2 is one room.
-RANKS = {"angles": 0, "objectives.functional": 0, "envs": 1, "models": 1, "objectives": 1, "designs": 1, "buffers": 1}
-RANKS |= {"products": 0, "learner": 2, "dynamics_learner": 2, "episode": 2, "imagination": 2, "coadaptation": 2}
+RANKS = {name: 0 for name in ("objectives.functional", "products", "angles")}
+RANKS |= {name: 1 for name in ("envs", "models", "objectives", "designs", "buffers", "batches")}
+RANKS |= {name: 2 for name in ("learner", "dynamics_learner", "episode", "imagination", "events", "coadaptation")}
 RECIPES_ONLY = "recipes/"
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
 HOMES |= {name: RECIPES_ONLY for name in ("wandb", "tyro", "matplotlib", "argparse")}

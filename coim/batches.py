@@ -1,0 +1,164 @@
+"""Batches out of replay buffers: many in one call, and put together from several buffers by exact numbers of rows.
+
+Shapes: ``B`` rows of a batch, ``K`` runs.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Sec. 5 (80 % real, 20 % imagined).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import TensorDictReplayBuffer
+
+
+def sample_batches(
+    buffer: TensorDictReplayBuffer,
+    *,
+    batch_size: int = 256,
+    num_batches: int = 1,
+    rng: torch.Generator | None = None,
+) -> TensorDict:
+    """Draw many batches in one call, uniformly and with replacement.
+
+    Args:
+        buffer: elements of batch size ``[K]``.
+        batch_size: B, elements per batch.
+        num_batches: batches drawn at once; fifty cost hardly more than one.
+        rng: draws the rows, on the buffer's device; None takes the buffer's own generator. Readers that run at the same
+            time need generators of their own, or who comes first decides what each of them gets.
+
+    Returns:
+        ``[num_batches, B, K]`` rows without TorchRL's ``index``.
+
+    Raises:
+        ValueError: if the buffer is empty or a number is below 1.
+    """
+    if min(batch_size, num_batches) < 1:
+        raise ValueError(f"{num_batches} batches of {batch_size} rows: both numbers must be at least 1")
+    if len(buffer) == 0:
+        raise ValueError(f"{batch_size} rows are wanted of an empty buffer; extend() it with transitions first")
+    if rng is None:
+        rows = buffer.sample(num_batches * batch_size)
+    else:
+        rows = buffer[torch.randint(len(buffer), (num_batches * batch_size,), generator=rng, device=rng.device)]
+    return rows.exclude("index").unflatten(0, (num_batches, batch_size))
+
+
+def sample_mixture(
+    sources: Sequence[tuple[TensorDictReplayBuffer, int]],
+    num_batches: int = 1,
+    *,
+    imagined: TensorDictReplayBuffer | None = None,
+    rng: torch.Generator | None = None,
+) -> TensorDict:
+    """Draw batches that are put together from several buffers, each with its exact number of rows.
+
+    Args:
+        sources: buffers and the rows that each gives to a batch, in the order in which they appear there. A buffer that
+            gives 0 rows may be empty.
+        num_batches: batches drawn at once.
+        imagined: which of the buffers holds imagined rows, Replay_Art; None writes no ``imagined``.
+        rng: as for :func:`sample_batches`.
+
+    Returns:
+        ``[num_batches, B, K]`` rows, B the sum of all rows, with ``imagined`` ``[num_batches, B, K, 1]`` written.
+
+    Raises:
+        ValueError: if a buffer that is drawn from is empty, or there are no rows to draw.
+
+    Example:
+        >>> from coim.buffers import ROW_KEYS, TransitionBuffer
+        >>> one, two = (TransitionBuffer(8, seed=0) for _ in range(2))
+        >>> rows = TensorDict({key: torch.zeros(8, 1, 1) for key in ROW_KEYS}, [8, 1])
+        >>> _ = one.extend(rows), two.extend(rows)
+        >>> sample_mixture([(one, 2), (two, 1)], imagined=two)["imagined"].flatten()
+        tensor([False, False,  True])
+    """
+    parts = []
+    for buffer, num_rows in sources:
+        if num_rows == 0:
+            continue
+        rows = sample_batches(buffer, batch_size=num_rows, num_batches=num_batches, rng=rng)
+        if imagined is not None:
+            flag = torch.full((*rows.batch_size, 1), buffer is imagined, device=rows["design"].device)
+            rows.set("imagined", flag)
+        parts.append(rows)
+    if not parts:
+        raise ValueError("a batch of 0 rows is asked for; let one of its sources give 1 or more")
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def sample_mixed(
+    real: TensorDictReplayBuffer,
+    imagined: TensorDictReplayBuffer,
+    *,
+    batch_size: int = 256,
+    share: float = 0.2,
+    num_batches: int = 1,
+) -> TensorDict:
+    """Draw the population's batches: 80 % real, 20 % imagined, exactly (Sec. 5).
+
+    With the defaults each batch is 205 real rows and then 51 imagined ones. (TorchRL's ``ReplayBufferEnsemble`` draws
+    the buffers at random, so that its shares hold on average only.)
+
+    Args:
+        real: Replay_Pop.
+        imagined: Replay_Art.
+        batch_size: B, rows per batch.
+        share: of imagined rows, in [0, 1]; they are the last ``round(share * B)``.
+        num_batches: batches drawn at once.
+
+    Returns:
+        ``[num_batches, B, K]`` rows with ``imagined`` ``[num_batches, B, K, 1]`` written.
+
+    Raises:
+        ValueError: if a buffer that is drawn from is empty, the share leaves [0, 1], or the batch is too small to hold
+            a row of each.
+    """
+    parts = batch_parts(batch_size, imagined=share)
+    return sample_mixture([(real, parts.own), (imagined, parts.imagined)], num_batches, imagined=imagined)
+
+
+@dataclass(frozen=True)
+class BatchParts:
+    """Rows of one batch by where they come from."""
+
+    own: int
+    other: int
+    imagined: int
+
+
+def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -> BatchParts:
+    """Whole rows for shares of a batch.
+
+    Args:
+        batch_size: rows in all.
+        imagined: share from Replay_Art, in [0, 1].
+        other: share from a second real buffer, in [0, 1].
+
+    Raises:
+        ValueError: if a share leaves [0, 1], the shares need more rows than there are, or one is too small for a row.
+
+    Example:
+        >>> batch_parts(256, imagined=0.2)
+        BatchParts(own=205, other=0, imagined=51)
+    """
+    for name, share in (("imagined", imagined), ("other", other)):
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"the {name} share is {share}, it must lie in [0, 1]")
+    rows = round(batch_size * imagined), round(batch_size * other)
+    own = batch_size - sum(rows)
+    if own < 0:
+        raise ValueError(f"shares {imagined} and {other} of a batch of {batch_size} rows need {sum(rows)}; lower them")
+    wanted = (1 - imagined - other, own), (other, rows[1]), (imagined, rows[0])
+    if any(share > 1e-9 and not count for share, count in wanted):
+        raise ValueError(
+            f"a batch of {batch_size} rows is smaller than its parts: shares {imagined} and {other} make it {own} + "
+            f"{rows[1]} + {rows[0]} rows; enlarge the batch, or set a share to 0"
+        )
+    return BatchParts(own=own, other=rows[1], imagined=rows[0])
