@@ -3,6 +3,10 @@
 Everything that is public, in one flat list. Importing it starts nothing, reads nothing and prints nothing.
 """
 
+# First, before TorchRL imports mujoco itself: a missing OpenGL library is then said in one sentence.
+from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, WorldModelEnv
+
+# isort: split
 from coim.batches import sample_batches, sample_mixed, sample_mixture
 from coim.buffers import Buffers, TransitionBuffer, transition_rows
 from coim.coadaptation import CoAdaptation
@@ -16,7 +20,6 @@ from coim.designs import (
     RandomDesigns,
 )
 from coim.dynamics_learner import DynamicsLearner
-from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, WorldModelEnv
 from coim.episode import run_episode
 from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
 from coim.imagination import imagine

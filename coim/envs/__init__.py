@@ -1,5 +1,15 @@
 """Robots whose bodies are set by a design, as TorchRL environments."""
 
+import os
+
+try:
+    import mujoco  # noqa: F401
+except AttributeError as error:  # PyOpenGL's way to say that the library which MUJOCO_GL names is not installed
+    raise ImportError(
+        f"MUJOCO_GL={os.environ.get('MUJOCO_GL')} names an OpenGL library that is missing: unset MUJOCO_GL, or install "
+        "the library (Debian: apt-get install libegl1 libegl-mesa0 for egl, libosmesa6 for osmesa)"
+    ) from error
+
 from coim.envs.half_cheetah import HalfCheetahMorph
 from coim.envs.hopper import HopperMorph
 from coim.envs.morph import MorphEnv

@@ -52,3 +52,10 @@ def test_without_opengl_one_sentence_says_what_to_set_and_to_install():
     assert said.startswith("MISSING no picture without OpenGL")
     assert "MUJOCO_GL=egl" in said
     assert "libegl1 libegl-mesa0" in said
+
+
+def test_a_missing_library_is_said_in_one_sentence_at_import():
+    """Where OSMesa is installed there is nothing to say."""
+    environment = {**os.environ, "MUJOCO_GL": "osmesa"}
+    out = subprocess.run([sys.executable, "-c", "import coim"], env=environment, capture_output=True, text=True)
+    assert out.returncode == 0 or out.stderr.splitlines()[-1].startswith("ImportError: MUJOCO_GL=osmesa names an OpenGL")
