@@ -58,4 +58,5 @@ def test_a_missing_library_is_said_in_one_sentence_at_import():
     """Where OSMesa is installed there is nothing to say."""
     environment = {**os.environ, "MUJOCO_GL": "osmesa"}
     out = subprocess.run([sys.executable, "-c", "import coim"], env=environment, capture_output=True, text=True)
-    assert out.returncode == 0 or out.stderr.splitlines()[-1].startswith("ImportError: MUJOCO_GL=osmesa names an OpenGL")
+    sentence = "ImportError: MUJOCO_GL=osmesa names an OpenGL library that is missing"
+    assert out.returncode == 0 or out.stderr.splitlines()[-1].startswith(sentence)
