@@ -66,7 +66,9 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
     progress = Progress(
         num_designs=settings.num_designs,
         total_episodes=sum(episodes_of(settings, index) for index in range(settings.num_designs)),
-        updates=settings.individual_updates + settings.population_updates + settings.model_updates,
+        updates=settings.individual_updates
+        + settings.population_updates
+        + settings.model_updates * (settings.designs != "none"),
         quiet=settings.quiet,
     )
     logger = open_wandb(folder, name, settings)

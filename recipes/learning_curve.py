@@ -1,7 +1,8 @@
 """Does it learn? One body that stays as drawn, the paper's sizes, with and without imagination, beside a random policy.
 
 ``python -m recipes.learning_curve`` trains the individual learner of Algorithm 1 on Half-Cheetah's unit body and writes
-the evaluation returns of every episode and seed, the random policy's return, and a picture of both.
+the evaluation returns of every episode and seed, the random policy's return, and a picture of both. With
+``--arms model-free "model-free in bfloat16"`` it compares the precisions.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import dataclasses
 import statistics
 from collections import defaultdict
 from pathlib import Path
+from typing import Literal
 
 import matplotlib.pyplot as plt
 import torch
@@ -26,8 +28,9 @@ from recipes.settings import Settings
 ARMS = {
     "model-free": Settings(designs="none"),
     "known designs imagined": Settings(designs="known", individual_imagined_share=0.2),
+    "model-free in bfloat16": Settings(designs="none", precision="bfloat16"),
 }
-COLOURS = {"model-free": "#0072B2", "known designs imagined": "#D55E00"}  # Okabe and Ito
+COLOURS = dict(zip(ARMS, ("#0072B2", "#D55E00", "#009E73")))  # Okabe and Ito
 COLUMNS = ["arm", "seed", "episode", "return"]
 
 
@@ -37,6 +40,11 @@ class Curve:
 
     out: Path = Path("docs/results/learning_curve")
     """Folder for curves.csv, summary.csv and curves.png; seeds that are in curves.csv already are not run again."""
+    arms: tuple[Literal["model-free", "known designs imagined", "model-free in bfloat16"], ...] = (
+        "model-free",
+        "known designs imagined",
+    )
+    """What is compared."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run for each of them and each arm."""
     episodes: int = 25
@@ -53,9 +61,9 @@ def main(curve: Curve) -> None:
         write(path, [COLUMNS])
     done = {(row["arm"], int(row["seed"])) for row in read(path)}
     for seed in curve.seeds:
-        for arm, settings in ARMS.items():
+        for arm in curve.arms:
             if (arm, seed) not in done:
-                write(path, returns(arm, dataclasses.replace(settings, seed=seed), curve.episodes))
+                write(path, returns(arm, dataclasses.replace(ARMS[arm], seed=seed), curve.episodes))
     if not any(row["arm"] == "random policy" for row in read(path)):
         write(path, [["random policy", 0, i + 1, value] for i, value in enumerate(random_returns(curve))])
     summarise(curve, read(path))
