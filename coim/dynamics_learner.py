@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 
 from coim.learner import Precision, share_storage, views
@@ -69,7 +70,11 @@ class DynamicsLearner:
         self.ensemble, self.num_runs = ensemble, num_runs
         self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
         self._lay_out(list(ensemble.network.parameters()), precision)
-        self.optimiser = torch.optim.Adam([self._weights], lr=lr, weight_decay=weight_decay, fused=True)
+        on_gpu = self._weights.device.type == "cuda"
+        self.optimiser = torch.optim.Adam(
+            [self._weights], lr=lr, weight_decay=weight_decay, fused=True, capturable=on_gpu
+        )
+        self._step = CudaGraphModule(self._update_once) if on_gpu else self._update_once
 
     def observe(self, rows: TensorDictBase) -> None:
         """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets."""
@@ -109,14 +114,16 @@ class DynamicsLearner:
         if next(self.ensemble.network.parameters()).data_ptr() != self._weights.data_ptr():
             raise RuntimeError("the ensemble was moved after its learner was made; make the learner last")
         inputs, targets = self._arrange(batches)
-        total = torch.zeros(self.num_runs or 1, dtype=targets.dtype, device=targets.device)
-        for x, target in zip(inputs, targets):
-            if self._read_weights.dtype != self._weights.dtype:
-                self._read_weights.copy_(self._weights)
-            total += self._write_gradients(x, target)
-            self.optimiser.step()
-        total /= len(inputs)
-        return TensorDict({"loss_dynamics": total}, total.shape)
+        mean = torch.stack([self._step(x, target) for x, target in zip(inputs, targets)]).mean(0)
+        return TensorDict({"loss_dynamics": mean}, mean.shape)
+
+    def _update_once(self, x: Tensor, target: Tensor) -> Tensor:
+        """One update with a batch, ``[K, B, F]`` and ``[K, B, S]``; its losses, ``[K]``."""
+        if self._read_weights.dtype != self._weights.dtype:
+            self._read_weights.copy_(self._weights)
+        losses = self._write_gradients(x, target)
+        self.optimiser.step()
+        return losses
 
     def _lay_out(self, parameters: list[nn.Parameter], precision: Precision) -> None:
         """Move all weights into one flat buffer, and cut it and that of the gradients into networks."""

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
@@ -56,6 +57,8 @@ class SACLearner:
             policy and critics scale their inputs differently.
 
     Note:
+        On CUDA an update is captured once as a CUDA graph and replayed: all batches must have one size there.
+
         Moving the modules to another device or dtype afterwards would part them from the flat buffers.
 
     Example:
@@ -91,17 +94,22 @@ class SACLearner:
         self.policy, self.qvalue = policy, qvalue
         self.loss = CoImSACLoss(policy, qvalue, alpha=alpha, gamma=gamma, mix=mix, num_runs=num_runs)
         SoftUpdate(self.loss, tau=tau)  # starts the targets at the critics, and tells TorchRL that they are cared for
-        self.tau, self.lr, self.num_runs = tau, lr, num_runs
+        self.tau, self.num_runs = tau, num_runs
         self._lay_out(policy.network.mlp, qvalue.module.mlp, precision)
-        self.optimiser = self._fresh_optimiser()
+        on_gpu = self._weights.device.type == "cuda"
+        self.optimiser = torch.optim.Adam([self._weights], lr=lr, fused=True, capturable=on_gpu)
+        self._step = CudaGraphModule(self._update_once) if on_gpu else self._update_once
         self.rng = torch.Generator(self._weights.device).manual_seed(seed)
 
+    @torch.no_grad()
     def start_from(self, other: SACLearner) -> None:
         """Take the other learner's weights, targets included, with an optimiser that has seen nothing (Algorithm 1)."""
-        with torch.no_grad():
-            self._weights.copy_(other._weights)
-            self._targets.copy_(other._targets)
-        self.optimiser = self._fresh_optimiser()
+        self._weights.copy_(other._weights)
+        self._targets.copy_(other._targets)
+        # In place: a captured CUDA graph goes on writing to these very moments.
+        for state in self.optimiser.state.values():
+            for moment in state.values():
+                moment.zero_()
 
     @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:
@@ -114,21 +122,29 @@ class SACLearner:
             ``loss_actor``, ``loss_qvalue`` and ``entropy`` of each run, ``[K]``: means over the U updates.
         """
         rows = self._arrange(batches)
-        history: list[Tensor] = []
-        for u in range(len(batches)):
-            if self._read_weights.dtype != self._weights.dtype:
-                self._read_weights.copy_(self._weights)
-                self._read_targets.copy_(self._targets)
-            found = [self._gradients(networks, run, rows, u) for run, networks in enumerate(self._networks)]
-            self._collect(found)
-            self.optimiser.step()
-            self._targets.lerp_(self._weights[-len(self._targets) :], self.tau)
-            history.append(torch.stack([torch.stack([g.loss_actor, g.loss_qvalue, g.entropy]) for g in found], -1))
-        means = torch.stack(history).mean(0).reshape(3, -1)
+        means = torch.stack([self._step(*(x[u] for x in rows)) for u in range(len(batches))]).mean(0)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
 
-    def _fresh_optimiser(self) -> torch.optim.Adam:
-        return torch.optim.Adam([self._weights], lr=self.lr, fused=True)
+    def _update_once(self, *rows: Tensor) -> Tensor:
+        """One update with the rows of a `Batch`, ``[K, B, ...]``; losses and entropy of each run, ``[3, K]``."""
+        if self._read_weights.dtype != self._weights.dtype:
+            self._read_weights.copy_(self._weights)
+            self._read_targets.copy_(self._targets)
+        one_by_one = len(self._networks) > 1 or self.num_runs is None
+        found = [
+            sac_gradients(
+                *networks,
+                Batch(*(x[run] for x in rows)) if one_by_one else Batch(*rows),
+                alpha=self.loss.alpha,
+                gamma=self.loss.gamma,
+                log_scale_range=LOG_SCALE_RANGE,
+            )
+            for run, networks in enumerate(self._networks)
+        ]
+        self._collect(found)
+        self.optimiser.step()
+        self._targets.lerp_(self._weights[-len(self._targets) :], self.tau)
+        return torch.stack([torch.stack([g.loss_actor, g.loss_qvalue, g.entropy]) for g in found], -1).reshape(3, -1)
 
     # -- one flat buffer, and views of it ------------------------------------------------------------------------------
 
@@ -202,16 +218,6 @@ class SACLearner:
 
     def _noise(self, action: Tensor) -> Tensor:
         return torch.randn(action.shape, generator=self.rng, dtype=action.dtype, device=action.device)
-
-    def _gradients(
-        self, networks: tuple[Network, list[Network], list[Network]], run: int, rows: Batch, u: int
-    ) -> SACGradients:
-        """Gradients of one run, or of all of them stacked, in update u."""
-        one = len(self._networks) > 1 or self.num_runs is None
-        batch = Batch(*(x[u, run] if one else x[u] for x in rows))
-        return sac_gradients(
-            *networks, batch, alpha=self.loss.alpha, gamma=self.loss.gamma, log_scale_range=LOG_SCALE_RANGE
-        )
 
     def _collect(self, found: list[SACGradients]) -> None:
         """Write gradients where Adam reads them, in the order of the flat buffer: layer, then run, then critic."""

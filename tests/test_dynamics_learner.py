@@ -165,3 +165,19 @@ def test_predicting_no_change_scores_one() -> None:
     rows = TensorDict({"observation": observation, "action": observation, "design": observation}, [1000, 1])
     rows["next"] = TensorDict({"observation": following}, [1000, 1])
     torch.testing.assert_close(learner.error(rows), torch.ones(1), rtol=0, atol=0.01)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("num_runs", [None, 3])
+def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> None:
+    """Twenty updates, of which all but the first few replay a captured graph."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    batches = make_rows(20, 16, *([num_runs] if num_runs else []))
+    ensembles = []
+    for device in ("cpu", "cuda"):
+        torch.manual_seed(0)
+        ensemble = ensemble_on(batches, num_runs=num_runs).to(device)
+        DynamicsLearner(ensemble, num_runs=num_runs).update(batches.to(device))
+        ensembles.append(ensemble.cpu())
+    assert_equal_weights(ensembles[1], ensembles[0], torch.float64)

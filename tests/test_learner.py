@@ -108,3 +108,30 @@ def test_the_policy_that_acts_is_the_one_that_learns(make_rows: Rows) -> None:
     before = learner.policy.network(observation, design)[0].clone()
     learner.update(make_rows(2, 8))
     assert not torch.equal(learner.policy.network(observation, design)[0], before)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("num_runs", [None, 3])
+def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> None:
+    """Twenty updates, of which all but the first few replay a captured graph, and twenty more after a fresh start."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    torch.manual_seed(0)
+    learners = []
+    for device in ("cpu", "cuda"):
+        torch.manual_seed(0)
+        policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).double().to(device)
+        qvalue = make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).double().to(device)
+        learners.append(SACLearner(policy, qvalue, num_runs=num_runs))
+    on_cpu, on_gpu = learners
+    for seed in (0, 1):
+        batches = make_rows(20, 32, *([num_runs] if num_runs else []), seed=seed)
+        noise = [torch.randn_like(batches["action"]) for _ in range(2)]
+        give_noise(on_cpu, noise)
+        give_noise(on_gpu, [part.cuda() for part in noise])
+        on_cpu.update(batches)
+        on_gpu.update(batches.cuda())
+        for learner in learners:
+            learner.start_from(learner)
+    for key, value in on_cpu.loss.state_dict().items():
+        torch.testing.assert_close(on_gpu.loss.state_dict()[key].cpu(), value, rtol=0, atol=1e-9)
