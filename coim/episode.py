@@ -58,11 +58,12 @@ def run_episode(
     actions = observation.new_empty(steps, *shape)
     rewards = observation.new_empty(steps, *env.batch_size, 1)
     broken = torch.zeros(steps, *env.batch_size, 1, dtype=torch.bool, device=observation.device)
+    network = None if policy is None else policy.network.for_design(design)
     for t in range(steps):
-        if policy is None:
+        if network is None:
             action = noise[t]
         else:
-            loc, scale = policy.network(observation, design)
+            loc, scale = network(observation)
             action = (loc if deterministic else torch.addcmul(loc, scale, noise[t])).tanh_()
         observations[t], actions[t] = observation, action
         observation, rewards[t], broken[t] = env.advance(action)

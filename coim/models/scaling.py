@@ -59,4 +59,8 @@ class InputScaling(nn.Module):
 
     def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
         """Scale both, ``[*B, S]`` and ``[*B, D]``."""
-        return observation / self.observation_scale, (design - self.design_centre) / self.design_reach
+        return observation / self.observation_scale, self.scaled_design(design)
+
+    def scaled_design(self, design: Tensor) -> Tensor:
+        """Designs from their bounds to [-1, 1], ``[*B, D]``."""
+        return (design - self.design_centre) / self.design_reach

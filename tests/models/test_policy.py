@@ -86,3 +86,17 @@ def test_actions_that_a_tanh_cannot_reach_are_refused(toy_env, spec):
 
     with pytest.raises(ValueError, match="ActionScaling"):
         make_policy(Foreign())
+
+
+@pytest.mark.parametrize(("runs", "rows"), [(None, 1), (None, 4), (1, 1), (3, 3)])
+def test_prepared_for_an_episode_it_computes_the_same_bits(toy_env, runs, rows):
+    torch.manual_seed(0)
+    policy = make_policy(toy_env, num_cells=(16, 16), num_runs=runs)
+    observations, design = torch.randn(5, rows, 3), torch.rand(rows, 2) + 0.5
+    network = policy.network.for_design(design)
+    with torch.no_grad():
+        for observation in observations:
+            for ours, expected in zip(network(observation), policy.network(observation, design)):
+                assert torch.equal(ours, expected)
+        policy.network.mlp.layers[0].weight.mul_(2)  # as a learner does
+        assert torch.equal(network(observations[0])[0], policy.network(observations[0], design)[0])
