@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 class InputScaling(nn.Module):
     """Observations over their typical spread, designs from their bounds to [-1, 1].
 
-    Joint velocities are twenty times joint angles: without scaling a network sees little else, and on Half-Cheetah a
-    controller takes ten times as many episodes (docs/results). The spreads are constants of the body, not statistics of
+    Joint velocities are twenty times joint angles, and without scaling a network sees little else (what that costs is
+    in docs/results). The spreads are constants of the body, not statistics of
     what was seen: they are the same for every arm, run and network, targets included, and nothing has to be kept up.
 
     Args:
