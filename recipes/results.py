@@ -1,4 +1,4 @@
-"""A run's folder: the settings, two CSV files that grow, and a picture at the end."""
+"""A run's folder: the settings, and three CSV files that grow."""
 
 from __future__ import annotations
 
@@ -58,6 +58,7 @@ class Results:
             ],
         )
         self._designs = Table(folder / "designs.csv", ["run", "design", "kind", *xi, "predicted", "best_return"])
+        self._metrics: Table | None = None  # its columns are known when the first episode is done
 
     def write(self, event: DesignChosen | EpisodeDone | DesignDone, seconds: float) -> None:
         """Append the rows of one event; ``seconds`` is the wall-clock of the run so far."""
@@ -72,6 +73,7 @@ class Results:
                 [run, event.index + 1, event.kind, *xi, event.episode + 1, *scores, event.env_steps, error, seconds]
                 for run, (xi, *scores, error) in enumerate(zip(event.design.tolist(), *returns, errors))
             )
+            self._write_metrics(event)
         else:
             self._designs.append(
                 [run, event.index + 1, event.kind, *xi, predicted, best]
@@ -79,6 +81,23 @@ class Results:
                     zip(event.design.tolist(), self._predicted, event.best_return.tolist())
                 )
             )
+
+    def _write_metrics(self, event: EpisodeDone) -> None:
+        """Append what was measured while learning; ``seconds`` are of all runs together, the same in each row."""
+        if self._metrics is None:
+            columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in event.seconds)]
+            self._metrics = Table(self.folder / "metrics.csv", columns)
+        seconds = list(event.seconds.values())
+        self._metrics.append(
+            [
+                run,
+                event.index + 1,
+                event.episode + 1,
+                *(float(values[run]) for values in event.metrics.values()),
+                *seconds,
+            ]
+            for run in range(len(event.design))
+        )
 
     def table(self) -> str:
         """The designs and their best returns, for a terminal."""

@@ -45,6 +45,21 @@ def test_a_run_leaves_its_settings_its_numbers_and_a_picture(tmp_path: Path, cap
     assert shown.count("\n") >= 7 + 8
 
 
+def test_what_was_measured_while_learning_has_a_row_for_each_run_and_episode(tmp_path: Path) -> None:
+    run(tmp_path / "fleet", "--num-runs", "2", "--num-designs", "2", "--first-episodes", "2", "--quiet")
+    rows = read(tmp_path / "fleet" / "metrics.csv")
+    assert [(row["run"], row["design"], row["episode"]) for row in rows] == [
+        (run, design, episode) for design in "12" for episode in "12" for run in "01"
+    ]
+    losses = {f"{who}/{what}" for who in ("individual", "population") for what in ("loss_actor", "loss_qvalue")}
+    parts = {"collect", "imagine", "train individual", "train population", "train model", "evaluate", "episode"}
+    measured = {"model_error", "model/loss_dynamics", "individual/entropy", "population/entropy"} | losses
+    assert rows[0].keys() == {"run", "design", "episode"} | measured | {f"seconds/{part}" for part in parts}
+    assert all(float(value) == float(value) for row in rows for value in row.values())  # numbers, none of them NaN
+    evaluations = read(tmp_path / "fleet" / "evaluations.csv")
+    assert [row["model_error"] for row in rows] == [row["model_error"] for row in evaluations]
+
+
 def test_the_same_seed_repeats_and_another_does_not(tmp_path: Path) -> None:
     for name, seed in (("a", "0"), ("b", "0"), ("c", "1")):
         run(tmp_path / name, "--seed", seed, "--quiet")
