@@ -69,6 +69,7 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
         updates=settings.individual_updates
         + settings.population_updates
         + settings.model_updates * (settings.designs != "none"),
+        imagined_share=algorithm.population_parts.imagined / settings.batch_size,
         quiet=settings.quiet,
     )
     logger = open_wandb(folder, name, settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import time
@@ -13,59 +14,78 @@ from coim import DesignChosen, DesignDone, EpisodeDone
 class Progress:
     """Follows the events of a run.
 
+    Returns and model errors are means over the runs that have one. A live line that is too long for its terminal is
+    written in a short form, so that the time left stays in sight on 80 columns.
+
     Args:
         num_designs: M.
         total_episodes: of the whole run, for the time left.
         updates: network updates after each episode, for the speed.
+        imagined_share: of a population batch.
         stream: where to write; None takes standard output.
         quiet: write nothing.
     """
 
     def __init__(
-        self, *, num_designs: int, total_episodes: int, updates: int, stream: TextIO | None = None, quiet: bool = False
+        self,
+        *,
+        num_designs: int,
+        total_episodes: int,
+        updates: int,
+        imagined_share: float = 0.0,
+        stream: TextIO | None = None,
+        quiet: bool = False,
     ) -> None:
         self._num_designs, self._total, self._updates = num_designs, total_episodes, updates
+        self._imagined_share = imagined_share
         self._stream, self._quiet = stream or sys.stdout, quiet
         self._live = self._stream.isatty()
-        self._episodes, self._best, self._started = 0, float("-inf"), time.perf_counter()
+        self._episodes, self._best, self._started = 0, -math.inf, time.perf_counter()
 
     def show(self, event: DesignChosen | EpisodeDone | DesignDone) -> None:
         """Write the line of an episode; other events move the state only."""
         if isinstance(event, DesignChosen):
-            self._best = float("-inf")
+            self._best = -math.inf
         if self._quiet or not isinstance(event, EpisodeDone):
             return
         self._episodes += 1
-        last = float(event.evaluation_return.mean())
+        last = float(event.evaluation_return.nanmean())
         self._best = max(self._best, last)
-        line = self._line(event, last)
+        long, short = self._lines(event, last)
         if self._live:
             width = shutil.get_terminal_size().columns - 1
+            line = long if len(long) <= width else short
             self._stream.write("\r" + line[:width].ljust(width))
         else:
-            self._stream.write(line + "\n")
+            self._stream.write(long + "\n")
         self._stream.flush()
 
-    def _line(self, event: EpisodeDone, last: float) -> str:
-        seconds = event.seconds["episode"]
+    def _lines(self, event: EpisodeDone, last: float) -> tuple[str, str]:
+        """The line in full, and in about 75 characters."""
+        design, episode = f"{event.index + 1}/{self._num_designs} {event.kind}", event.episode + 1
+        returns = f"{last:.1f} (best {self._best:.1f})"
         error = event.metrics.get("model_error")
-        left = (self._total - self._episodes) * (time.perf_counter() - self._started) / self._episodes
-        return "  ".join(
-            [
-                f"design {event.index + 1}/{self._num_designs} {event.kind}",
-                f"episode {event.episode + 1}",
-                f"return {last:.1f} (best {self._best:.1f})",
-                f"imagined {event.imagined}",
-                "model error " + ("-" if error is None else f"{float(error.mean()):.3f}"),
-                f"{self._updates / seconds:.0f} updates/s",
-                f"{_clock(left)} left",
-            ]
-        )
+        mean_error = "-" if error is None else f"{float(error.nanmean()):.3f}"
+        speed = f"{self._updates / event.seconds['episode']:.0f}"
+        left = _clock((self._total - self._episodes) * (time.perf_counter() - self._started) / self._episodes)
+        share = f"{self._imagined_share:.0%}"
+        long = [
+            f"design {design}",
+            f"episode {episode}",
+            f"return {returns}",
+            f"imagined {share}",
+            f"model error {mean_error}",
+            f"{speed} updates/s",
+            f"{left} left",
+        ]
+        short = [design, f"ep {episode}", returns, f"im {share}", f"err {mean_error}", f"{speed}/s", left]
+        return "  ".join(long), " ".join(short)
 
     def end(self) -> None:
-        """Leave the live line behind."""
-        if self._live and not self._quiet:
+        """Leave the live line behind, if there is one."""
+        if self._live and not self._quiet and self._episodes:
             self._stream.write("\n")
+            self._stream.flush()
 
 
 def _clock(seconds: float) -> str:

@@ -1,0 +1,98 @@
+"""The progress line on a terminal, in a pipe, and when nobody wants it."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import torch
+
+from coim import DesignChosen, DesignDone, EpisodeDone
+from recipes.progress import Progress
+
+FIELDS = ("design 1/2 first", "episode 2", "return 5.0 (best 7.0)", "imagined 20%", "model error 0.250", "60 updates/s")
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def episode(index: int, number: int, returns: list[float], *, error: float | None = 0.25) -> EpisodeDone:
+    return EpisodeDone(
+        index=index,
+        kind="first",
+        episode=number,
+        design=torch.ones(len(returns), 2),
+        training_return=torch.zeros(len(returns)),
+        evaluation_return=torch.tensor(returns),
+        env_steps=10,
+        imagined=51,
+        metrics={} if error is None else {"model_error": torch.full((len(returns),), error)},
+        seconds={"episode": 0.5},
+    )
+
+
+def show_two(stream: io.StringIO, **options: bool) -> str:
+    progress = Progress(num_designs=2, total_episodes=4, updates=30, imagined_share=0.2, stream=stream, **options)
+    design = torch.ones(2, 2)
+    progress.show(DesignChosen(0, "first", design, None))
+    progress.show(episode(0, 0, [6.0, 8.0]))
+    progress.show(episode(0, 1, [4.0, 6.0]))
+    progress.show(DesignDone(0, "first", design, torch.tensor([6.0, 8.0])))
+    progress.end()
+    return stream.getvalue()
+
+
+def test_a_pipe_gets_one_plain_line_per_episode() -> None:
+    shown = show_two(io.StringIO())
+    assert "\r" not in shown
+    assert shown.endswith(" left\n")
+    assert len(shown.splitlines()) == 2
+    assert all(field in shown.splitlines()[1] for field in FIELDS)
+
+
+def test_a_terminal_gets_one_line_that_is_written_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    shown = show_two(Terminal())
+    assert shown.count("\n") == 1
+    first, second = shown.removesuffix("\n").split("\r")[1:]
+    assert len(first) == len(second) == 159  # nothing of the first stays beside the second
+    assert all(field in second for field in FIELDS)
+    assert second.rstrip().endswith(" left")
+
+
+def test_a_narrow_terminal_still_sees_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    last = show_two(Terminal()).removesuffix("\n").split("\r")[-1]
+    assert len(last) == 79
+    assert last.startswith("1/2 first ep 2 5.0 (best 7.0) im 20% err 0.250 60/s 0:00:0")
+
+
+@pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
+def test_quiet_is_quiet(stream: io.StringIO) -> None:
+    assert show_two(stream, quiet=True) == ""
+
+
+def test_the_best_return_is_that_of_the_design() -> None:
+    stream = io.StringIO()
+    progress = Progress(num_designs=2, total_episodes=2, updates=30, stream=stream)
+    for index, value in enumerate((9.0, 3.0)):
+        progress.show(DesignChosen(index, "first", torch.ones(1, 2), None))
+        progress.show(episode(index, 0, [value], error=None))
+    assert "design 2/2 first  episode 1  return 3.0 (best 3.0)  imagined 0%  model error -" in stream.getvalue()
+
+
+def test_a_run_that_has_no_number_is_left_out_of_the_mean() -> None:
+    stream = io.StringIO()
+    Progress(num_designs=1, total_episodes=2, updates=30, stream=stream).show(episode(0, 0, [float("nan"), 3.0]))
+    assert "return 3.0 (best 3.0)" in stream.getvalue()
+    assert "nan" not in stream.getvalue()
+
+
+def test_an_interrupted_start_leaves_no_empty_line() -> None:
+    stream = Terminal()
+    Progress(num_designs=1, total_episodes=1, updates=1, stream=stream).end()
+    assert stream.getvalue() == ""
