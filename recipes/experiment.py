@@ -34,6 +34,7 @@ from coim.designs import DesignGenerator, DesignSearch
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.pictures import draw_run
 from recipes.progress import Progress
+from recipes.report import write_report
 from recipes.results import Results, default_folder, describe
 from recipes.settings import Settings, episodes_of, parse
 
@@ -83,10 +84,10 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
         if logger is not None:
             log(logger, event, num_runs=settings.num_runs)
     progress.end()
-    picture = draw_run(folder, body)
+    picture, report = draw_run(folder, body), write_report([folder], body=body)
     if not settings.quiet:
         print(results.table())
-        print(f"picture: {picture}")
+        print(f"picture: {picture}\nreport: {report}")
     return folder
 
 

@@ -1,0 +1,109 @@
+"""Curves over designs and over training: what the pictures of a run and of a comparison are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from recipes.palette import GREY, KINDS, LIGHT, kind_handles, put_legend, style_of
+from recipes.records import Curves, Record, Row, curves
+
+WIDTH = 7.2  # inches: A4 within its margins
+STEPS = "training steps of one run"
+MANY_POINTS = 2000  # faint lines of more points than that are pixels, so that the page stays small
+
+
+def new_figure(height: float, rows: int = 1, columns: int = 1, *, sharex: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure of the page's width with axes that have no frame at the top and right."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.06)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex).ravel().tolist()
+    for axes in grid:
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure, grid
+
+
+def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = True, **style: str) -> None:
+    """Each run a faint line, their mean a strong one."""
+    if not found.x.size:
+        return
+    if faint and len(found.y) > 1:
+        for run in found.y:
+            pixels = run.size * len(found.y) > MANY_POINTS
+            axes.plot(found.x, run, color=style["color"], linewidth=0.6, alpha=0.35, zorder=1, rasterized=pixels)
+    marker = "o" if found.x.size == 1 else ""  # a line through one point would not be seen
+    axes.plot(found.x, found.mean, linewidth=1.4, zorder=3, label=label, marker=marker, **style)
+
+
+def plot_over_steps(
+    axes: Axes, records: Sequence[Record], column: str, *, prefix: str = "", faint: bool = True, **style: str
+) -> bool:
+    """One column of the episodes of each folder over training steps; says whether there was a number at all."""
+    drawn = False
+    for index, record in enumerate(records):
+        found = curves(record.episodes, "env_steps", column)
+        plot_curves(axes, found, label=prefix or record.name, faint=faint, **(style_of(index, len(records)) | style))
+        drawn |= bool(found.x.size)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    return drawn
+
+
+def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> None:
+    """One column of the designs of each folder: faint lines of runs, a mean, a mark at each design for its kind.
+
+    A hollow mark is a design that still has episodes to come.
+    """
+    for index, record in enumerate(records):
+        style = style_of(index, len(records))
+        found = curves(record.designs, "design", column)
+        line = style | ({"color": GREY} if len(records) == 1 and len(found.y) == 1 else {})
+        plot_curves(axes, found, label=record.name, **line)
+        if len(records) == 1:
+            mark_kinds(axes, record.designs, column)
+            continue
+        means = dict(zip(found.x.tolist(), found.mean.tolist()))
+        mark_kinds(axes, [{**row, column: means.get(row["design"])} for row in record.designs], column, style["color"])
+    axes.xaxis.get_major_locator().set_params(integer=True)
+
+
+def mark_kinds(axes: Axes, rows: Sequence[Row], column: str, colour: str | None = None, x: str = "design") -> None:
+    """A mark at each design by its kind; ``colour`` overrules the kind's own."""
+    for kind, (own, marker) in KINDS.items():
+        for finished in (True, False):
+            points = [(row[x], row[column]) for row in rows if (row["kind"], row["finished"]) == (kind, finished)]
+            if points:
+                paint = colour or own
+                fill = paint if finished else "white"
+                axes.scatter(*zip(*points), s=22, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
+
+
+def explain(
+    figure: Figure,
+    records: Sequence[Record],
+    *,
+    kinds: bool = False,
+    mean: bool = True,
+    more: Sequence[Line2D] = (),
+) -> None:
+    """A legend above the figure: folders where there are several, kinds of design where they are marked, the mean."""
+    several = len(records) > 1
+    handles = [Line2D([], [], label=r.name, **style_of(i, len(records))) for i, r in enumerate(records) if several]
+    if kinds:
+        there = [row["kind"] for record in records for row in record.designs]
+        handles += kind_handles(there, GREY if several else None)
+        if any(not row["finished"] for record in records for row in record.designs):
+            hollow = {"markerfacecolor": "white", "markeredgecolor": GREY}
+            handles.append(Line2D([], [], marker="o", linestyle="", label="not finished", **hollow))
+    if mean and not several and records[0].num_runs > 1:
+        handles.append(Line2D([], [], label=f"mean of {records[0].num_runs} runs", **style_of(0, 1)))
+    put_legend(figure, [*handles, *more])
+
+
+def mark_builds(axes: Axes, record: Record) -> None:
+    """A light line wherever the next body was built."""
+    first = {row["design"]: row["env_steps"] for row in reversed(record.episodes)}
+    for steps in list(dict(sorted(first.items())).values())[1:]:
+        axes.axvline(steps, color=LIGHT, linewidth=0.6, zorder=0)

@@ -1,0 +1,45 @@
+"""Colours, shapes and legends of all pictures.
+
+Okabe and Ito's palette: its contrasts survive the common kinds of colour blindness. Shapes and dashes tell things apart
+too, on paper without colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+BLACK, GREY, LIGHT = "#000000", "#999999", "#E0E0E0"
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+
+KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s")}
+DASHES = ("-", "--", ":")
+CHARACTERS = 120  # of a legend, side by side on a page
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+
+
+def style_of(index: int, count: int) -> dict[str, str]:
+    """Colour and dashes of one of several things that are compared; black where there is nothing to compare with."""
+    if count == 1:
+        return {"color": BLACK, "linestyle": "-"}
+    return {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index // len(COLOURS) % len(DASHES)]}
+
+
+def kind_handles(kinds: Iterable[str], colour: str | None = None) -> list[Line2D]:
+    """Entries of a legend for kinds of design; ``colour`` overrules the kind's own."""
+    there = set(kinds)
+    return [
+        Line2D([], [], color=colour or own, marker=marker, linestyle="", label=f"{kind} design")
+        for kind, (own, marker) in KINDS.items()
+        if kind in there
+    ]
+
+
+def put_legend(figure: Figure, handles: list[Line2D]) -> None:
+    """A legend above a figure, in as many columns as its words leave room for."""
+    if handles:
+        longest = max(len(str(handle.get_label())) for handle in handles)
+        columns = max(1, min(len(handles), CHARACTERS // (longest + 8)))
+        figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False)

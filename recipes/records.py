@@ -1,0 +1,188 @@
+"""What the folders of runs hold, read back: also while a run is still writing to them.
+
+Shapes: K runs, X points of a curve.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+WORDS = ("kind",)  # cells that are not numbers
+COUNTS = ("run", "design", "episode", "env_steps")
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run folder.
+
+    Attributes:
+        name: what the report calls it.
+        config: ``config.json``.
+        episodes: rows of ``evaluations.csv``, each with the cells that ``metrics.csv`` has for it.
+        designs: a row per run and design, also of those under way: run, design, kind, xi, best_return, predicted.
+    """
+
+    name: str
+    config: dict[str, Any]
+    episodes: list[Row]
+    designs: list[Row]
+
+    @property
+    def environment(self) -> str:
+        """Name of the body."""
+        return self.config["environment"]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Every setting of the run."""
+        return self.config["settings"]
+
+    @property
+    def num_runs(self) -> int:
+        """Runs that have a return."""
+        return len({row["run"] for row in self.episodes if math.isfinite(row["return"])})
+
+    @property
+    def best(self) -> dict[int, Row]:
+        """The best design of each run that has one."""
+        ranked = sorted((row for row in self.designs if math.isfinite(row["best_return"])), key=_best_return)
+        return {row["run"]: row for row in ranked}
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Curves of K runs over the same points.
+
+    Attributes:
+        x: ``[X]``.
+        y: ``[K, X]``, NaN where a run has no number.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Over the runs that have a number, ``[X]``."""
+        known = np.isfinite(self.y)
+        count = known.sum(0)
+        total = np.where(known, self.y, 0.0).sum(0)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def curves(rows: Sequence[Row], x: str, y: str) -> Curves:
+    """One column over another, run by run; rows without the column are gaps."""
+    runs = sorted({row["run"] for row in rows})
+    points = sorted({row[x] for row in rows})
+    values = np.full((len(runs), len(points)), np.nan)
+    row_of, column_of = ({value: i for i, value in enumerate(found)} for found in (runs, points))
+    for row in rows:
+        values[row_of[row["run"]], column_of[row[x]]] = row.get(y, math.nan)
+    values[~np.isfinite(values)] = np.nan
+    known = np.isfinite(values).any(0)
+    return Curves(np.array(points, dtype=float)[known], values[:, known])
+
+
+def read_records(folders: Sequence[Path]) -> list[Record]:
+    """Read run folders that are to be compared.
+
+    Raises:
+        ValueError: if one of them is no run, has no rows yet, or is of another environment than the first.
+    """
+    names = [folder.resolve().name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [str(folder) for folder in folders]
+    records = [read_record(folder, name) for folder, name in zip(folders, names)]
+    environments = list(dict.fromkeys(record.environment for record in records))
+    if len(environments) > 1:
+        raise ValueError(f"the folders hold runs of {' and '.join(environments)}; compare runs of one environment")
+    return records
+
+
+def read_record(folder: Path, name: str) -> Record:
+    """Read one run folder; see :func:`read_records`."""
+    if not (folder / "config.json").is_file():
+        raise ValueError(f"{folder} is no run folder: it has no config.json; name a folder that a recipe wrote")
+    try:
+        config = json.loads((folder / "config.json").read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"the config.json of {folder} cannot be read ({error})") from None
+    if not isinstance(config, dict) or not {"environment", "settings"} <= config.keys():
+        raise ValueError(f"{folder} is no run folder: its config.json names no environment and settings")
+    episodes = read_rows(folder / "evaluations.csv")
+    if not episodes:
+        raise ValueError(f"{folder / 'evaluations.csv'} has no rows; wait for the first episode of the run")
+    metrics = {_place(row): row for row in read_rows(folder / "metrics.csv")}
+    episodes = [row | metrics.get(_place(row), {}) for row in episodes]
+    return Record(name, config, episodes, best_of_designs(episodes, read_rows(folder / "designs.csv")))
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows of a CSV file with numbers as numbers, the design as one tuple ``xi`` and NaN in empty cells.
+
+    A last line that is still being written is left out, and a file that is not there has no rows.
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        whole = [line for line in file if line.endswith("\n")]
+    return [_typed(row) for row in csv.DictReader(whole) if None not in row.values()]
+
+
+def _typed(cells: dict[str, str]) -> Row:
+    design = tuple(float(cell) for key, cell in cells.items() if key.startswith("xi_"))
+    row: Row = {"xi": design} if design else {}
+    for key, cell in cells.items():
+        if key in WORDS:
+            row[key] = cell
+        elif key in COUNTS:
+            row[key] = int(cell)
+        elif not key.startswith("xi_"):
+            row[key] = _number(cell)
+    return row
+
+
+def _number(cell: str) -> float:
+    """NaN for a cell that holds no number."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+def best_of_designs(episodes: Sequence[Row], finished: Sequence[Row]) -> list[Row]:
+    """A row per run and design from the episodes so far; Eq. 5 where ``designs.csv`` has the design already."""
+    predicted = {(row["run"], row["design"]): row["predicted"] for row in finished}
+    designs: dict[tuple[int, int], Row] = {}
+    for row in episodes:
+        key = (row["run"], row["design"])
+        if key not in designs:
+            known = {"predicted": predicted.get(key, math.nan), "finished": key in predicted}
+            designs[key] = {name: row[name] for name in ("run", "design", "kind", "xi")} | known
+            designs[key]["best_return"] = row["return"]
+        designs[key]["best_return"] = float(np.fmax(designs[key]["best_return"], row["return"]))
+    return list(designs.values())
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for a reader: that many significant digits, thousands in full, a dash for what is not known."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if 10 ** (digits - 1) <= abs(value) < 1e7 else f"{value:.{digits}g}"
+
+
+def _place(row: Row) -> tuple[int, int, int]:
+    return row["run"], row["design"], row["episode"]
+
+
+def _best_return(row: Row) -> float:
+    return row["best_return"]

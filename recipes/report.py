@@ -1,0 +1,159 @@
+"""What became of a run, on one page: ``python -m recipes.report runs/A``, or ``runs/A runs/B`` for a comparison.
+
+The page opens from a file, without a network. A run that is still going on can be looked at too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import tyro
+
+from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
+from recipes import diagnostics, figures
+from recipes.figures import Picture
+from recipes.page import FONT, image, note, page, section, table
+from recipes.records import Record, Row, number, read_records
+
+BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph, "walker": WalkerMorph}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write report.html about a run, or a comparison of several."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders of one environment."""
+    out: Path | None = None
+    """The page; by default report.html in the first folder."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    asked = tyro.cli(Report, prog="python -m recipes.report", args=arguments)
+    try:
+        print(write_report(asked.folders, out=asked.out))
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type[MorphEnv] | None = None) -> Path:
+    """Write one self-contained page.
+
+    Args:
+        folders: of the runs, at least one.
+        out: the page; by default ``report.html`` in the first folder.
+        body: what the designs belong to; by default what the environment's name says, and if no such environment is
+            known the bodies are not drawn.
+
+    Returns:
+        The page.
+
+    Raises:
+        ValueError: if there is no folder, one is no run or has no rows yet, or their environments differ.
+    """
+    if not folders:
+        raise ValueError("no folder is named; give at least one, such as runs/hopper-20260101-120000-run")
+    records = read_records(folders)
+    body = body or BODIES.get(records[0].environment)
+    path = out or folders[0] / "report.html"
+    if path.is_dir():
+        path = path / "report.html"
+    with mpl.rc_context(FONT):
+        sections = [in_short(records), *(show(picture) for picture in pictures_of(records, body)), *in_full(records)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    title = f"{records[0].environment}: {', '.join(record.name for record in records)}"
+    path.write_text(page(title, sections), encoding="utf-8")
+    return path
+
+
+def pictures_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[Picture]:
+    """All pictures, in the order in which they are read."""
+    return [
+        figures.best_returns(records),
+        diagnostics.learning_curves(records),
+        figures.designs_over_time(records, body),
+        figures.bodies(records, body),
+        figures.predictions(records),
+        diagnostics.model_errors(records),
+        diagnostics.losses(records),
+        diagnostics.times(records),
+    ]
+
+
+def show(picture: Picture) -> str:
+    """The section of a picture, or of the sentence that says why there is none."""
+    if picture.figure is None:
+        return section(picture.title, note(picture.caption))
+    return section(picture.title, image(picture.figure, alt=picture.alt, caption=picture.caption), kind="picture")
+
+
+def in_short(records: Sequence[Record]) -> str:
+    """Where each folder stands, and its best returns: a table by folder, or of one folder by run."""
+    states = "".join(note(f"{record.name}: {state(record)}") for record in records)
+    if len(records) == 1:
+        size = len(records[0].designs[0]["xi"])
+        head = ["run", "best return", "design", "kind", *(f"xi_{i + 1}" for i in range(size))]
+        rows = [
+            [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, row["xi"])]
+            for run, row in sorted(records[0].best.items())
+        ]
+        return section("Best bodies", states + table(head, rows))
+    head = ["folder", "runs", "best return, mean", "standard deviation", "lowest", "highest", "designs", "episodes"]
+    return section("Best returns", states + table(head, [compared(record) for record in records]))
+
+
+def compared(record: Record) -> list[str]:
+    """A row of the comparison: statistics over the runs of a folder, of each run's best return."""
+    best = [row["best_return"] for row in record.best.values()]
+    mean, low, high = (statistics.fmean(best), min(best), max(best)) if best else (math.nan,) * 3
+    deviation = statistics.stdev(best) if len(best) > 1 else math.nan
+    designs, episodes = (
+        len({(row["design"], row.get("episode")) for row in r}) for r in (record.designs, record.episodes)
+    )
+    counts = [str(designs), str(episodes)]
+    return [record.name, str(record.num_runs), *map(number, (mean, deviation, low, high)), *counts]
+
+
+def state(record: Record) -> str:
+    """How far a run is, in a sentence."""
+    last: Row = record.episodes[-1]
+    planned = record.settings.get("num_designs", "?")
+    begun = f"started {record.config.get('started', 'at an unknown time')}, {record.num_runs} run(s)"
+    if last["design"] == planned and all(row["finished"] for row in record.designs):
+        return f"{begun}; all {planned} designs are done, after {last['seconds'] / 60:.3g} min."
+    where = f"design {last['design']} of {planned}, episode {last['episode']}"
+    return f"{begun}; at {where} after {last['seconds'] / 60:.3g} min: going on, or stopped there."
+
+
+def in_full(records: Sequence[Record]) -> list[str]:
+    """The settings, the versions and the machine of each folder."""
+    several = len(records) > 1
+    origin = [
+        {"revision": r.config.get("revision"), "started": r.config.get("started")}
+        | dict(r.config.get("machine", {}))
+        | dict(r.config.get("versions", {}))
+        for r in records
+    ]
+    found = []
+    for title, values in (("Settings", [r.settings for r in records]), ("Versions and machine", origin)):
+        names = list(dict.fromkeys(name for value in values for name in value))
+        rows = [[name, *(plain(value.get(name)) for value in values)] for name in names]
+        found.append(section(title, table(["", *(r.name for r in records)], rows, differing=several)))
+    return found
+
+
+def plain(value: Any) -> str:
+    """A setting as it would be typed."""
+    return "-" if value is None else " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+if __name__ == "__main__":
+    main()
