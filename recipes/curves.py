@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
@@ -13,6 +14,8 @@ from recipes.records import Curves, Record, Row, curves
 
 WIDTH = 7.2  # inches: A4 within its margins
 STEPS = "training steps of one run"
+MANY_MARKS = 120
+MOST_EPISODES = 500  # points of a curve; of more, neighbours are averaged
 MANY_POINTS = 2000  # faint lines of more points than that are pixels, so that the page stays small
 
 
@@ -38,13 +41,24 @@ def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = Tru
     axes.plot(found.x, found.mean, linewidth=1.4, zorder=3, label=label, marker=marker, **style)
 
 
+def episodes_in_a_point(record: Record) -> int:
+    """Episodes that a point of a curve over training steps is the mean of."""
+    return max(1, math.ceil(len({row["env_steps"] for row in record.episodes}) / MOST_EPISODES))
+
+
+def points_in_words(records: Sequence[Record]) -> str:
+    """A sentence on what a point is the mean of, where it is one of several episodes."""
+    most = max(episodes_in_a_point(record) for record in records)
+    return f" A point is the mean of {'up to ' if len(records) > 1 else ''}{most} episodes." if most > 1 else ""
+
+
 def plot_over_steps(
     axes: Axes, records: Sequence[Record], column: str, *, prefix: str = "", faint: bool = True, **style: str
 ) -> bool:
     """One column of the episodes of each folder over training steps; says whether there was a number at all."""
     drawn = False
     for index, record in enumerate(records):
-        found = curves(record.episodes, "env_steps", column)
+        found = curves(record.episodes, "env_steps", column).averaged(episodes_in_a_point(record))
         plot_curves(axes, found, label=prefix or record.name, faint=faint, **(style_of(index, len(records)) | style))
         drawn |= bool(found.x.size)
     axes.xaxis.set_major_formatter("{x:,.0f}")
@@ -61,11 +75,9 @@ def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> Non
         found = curves(record.designs, "design", column)
         line = style | ({"color": GREY} if len(records) == 1 and len(found.y) == 1 else {})
         plot_curves(axes, found, label=record.name, **line)
-        if len(records) == 1:
-            mark_kinds(axes, record.designs, column)
-            continue
         means = dict(zip(found.x.tolist(), found.mean.tolist()))
-        mark_kinds(axes, [{**row, column: means.get(row["design"])} for row in record.designs], column, style["color"])
+        rows = {row["design"]: row | {column: means.get(row["design"], math.nan)} for row in record.designs}
+        mark_kinds(axes, list(rows.values()), column, style["color"] if len(records) > 1 else None)
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
@@ -77,7 +89,8 @@ def mark_kinds(axes: Axes, rows: Sequence[Row], column: str, colour: str | None 
             if points:
                 paint = colour or own
                 fill = paint if finished else "white"
-                axes.scatter(*zip(*points), s=22, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
+                size = 22 if len(rows) <= MANY_MARKS else 9
+                axes.scatter(*zip(*points), s=size, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
 
 
 def explain(

@@ -9,7 +9,16 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from recipes.curves import STEPS, explain, mark_builds, new_figure, plot_curves, plot_over_steps
+from recipes.curves import (
+    STEPS,
+    episodes_in_a_point,
+    explain,
+    mark_builds,
+    new_figure,
+    plot_curves,
+    plot_over_steps,
+    points_in_words,
+)
 from recipes.figures import Picture
 from recipes.palette import BLACK, BLUE, GREY, SKY, style_of
 from recipes.records import Record, curves, number
@@ -28,7 +37,7 @@ def learning_curves(records: Sequence[Record]) -> Picture:
     caption = "Return of the deterministic policy after each training episode."
     if len(records) == 1:
         mark_builds(axes, records[0])
-        sampled = curves(records[0].episodes, "env_steps", "training_return")
+        sampled = curves(records[0].episodes, "env_steps", "training_return").averaged(episodes_in_a_point(records[0]))
         plot_curves(axes, sampled, faint=False, color=SKY, linestyle="-", label="training episode, sampled actions")
         plot_over_steps(axes, records, "return", prefix="evaluation episode, deterministic actions")
         figure.legend(loc="outside upper center", ncols=2, frameon=False)
@@ -38,6 +47,7 @@ def learning_curves(records: Sequence[Record]) -> Picture:
         explain(figure, records)
     axes.set(xlabel=f"{STEPS} (1)", ylabel="return of an episode (1)")
     last = [f"{r.name}: {curves(r.episodes, 'env_steps', 'return').mean[-1:].round(2).tolist()}" for r in records]
+    caption += points_in_words(records)
     return Picture("Learning curves", caption, "Return over training steps. Last mean: " + "; ".join(last), figure)
 
 
@@ -59,7 +69,7 @@ def model_errors(records: Sequence[Record]) -> Picture:
     caption = (
         "Squared error of the model's means on each new episode before learning from it, in units of the variance of "
     )
-    caption += "one-step changes. Dashed: as good as predicting that nothing changes."
+    caption += "one-step changes. Dashed: as good as predicting that nothing changes." + points_in_words(records)
     ends = [f"{r.name}: {m[0]:.3g} to {m[-1]:.3g}" for r in records if (m := _means(r, "model_error")).size]
     return Picture(title, caption, "Model error over training steps. " + "; ".join(ends), figure)
 
@@ -88,7 +98,10 @@ def losses(records: Sequence[Record]) -> Picture:
     grey = {"color": BLACK if alone else GREY}
     lines = [Line2D([], [], label=f"{who} learner", **grey | style) for who, style in learners.items()]
     explain(figure, records, mean=False, more=lines)
-    caption = "Means over the updates after each episode, of the learners' losses and of the model's."
+    caption = (
+        "Means over the updates after each episode, of the learners' losses and of the model's."
+        + points_in_words(records)
+    )
     caption += " Faint lines: single runs." if alone and records[0].num_runs > 1 else ""
     return Picture(
         title, caption, "Actor loss, critic loss, weighted entropy and model loss over training steps.", figure

@@ -105,6 +105,9 @@ def in_short(records: Sequence[Record]) -> str:
             [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, row["xi"])]
             for run, row in sorted(records[0].best.items())
         ]
+        if len(rows) > 1:
+            mean = statistics.fmean(row["best_return"] for row in records[0].best.values())
+            rows.append([f"mean of {len(rows)} runs", number(mean), *[""] * (2 + size)])
         return section("Best bodies", states + table(head, rows))
     head = ["folder", "runs", "best return, mean", "standard deviation", "lowest", "highest", "designs", "episodes"]
     return section("Best returns", states + table(head, [compared(record) for record in records]))

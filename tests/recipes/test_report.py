@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from coim import HopperMorph
 from recipes import experiment
 from recipes.figures import describe_correlation, rank_correlation
-from recipes.records import read_record, read_records
+from recipes.records import curves, read_record, read_records
 from recipes.report import main, write_report
 from tests.recipes.test_experiment import TINY
 
@@ -235,6 +235,24 @@ def test_the_rank_correlation_is_spearmans() -> None:
     assert describe_correlation(rising) == "Spearman's rank correlation 1.00 (n = 3 designs)"
     assert "0.00, mean of 2 runs, from -1.00 to 1.00 (n = 3 each)" in describe_correlation(rising + falling)
     assert describe_correlation([]) == "rank correlation not defined (n = 0 designs)"
+
+
+def test_curves_are_means_over_the_runs_and_neighbours_that_have_a_number() -> None:
+    rows = [{"run": k, "x": x, "y": float(10 * k + x)} for k in (0, 1) for x in range(5)]
+    rows[3]["y"] = float("nan")  # run 0 at 3
+    rows += [{"run": 0, "x": 5, "y": float("nan")}]
+    found = curves(rows, "x", "y")
+    assert found.x.tolist() == [0, 1, 2, 3, 4]
+    assert found.mean.tolist() == [5, 6, 7, 13, 9]
+    pairs = found.averaged(2)
+    assert pairs.x.tolist() == [0.5, 2.5, 4]
+    assert pairs.y.tolist() == [[0.5, 2, 4], [10.5, 12.5, 14]]
+    assert found.averaged(1) is found
+
+
+def test_long_runs_are_drawn_as_means_of_neighbouring_episodes(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recipes.curves.MOST_EPISODES", 3)
+    assert "A point is the mean of 3 episodes." in check(write_report([runs / "one"], out=runs / "long.html")).words
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")
