@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recipes.palette import GREY, KINDS, LIGHT, kind_handles, put_legend, style_of
+from recipes.palette import GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
 from recipes.records import Curves, Record, Row, curves
 
 WIDTH = 7.2  # inches: A4 within its margins
@@ -34,9 +34,9 @@ def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = Tru
     if not found.x.size:
         return
     if faint and len(found.y) > 1:
+        faintness = {"linewidth": 0.6, "alpha": max(0.15, min(0.4, 1.5 / len(found.y))), "zorder": 1}
         for run in found.y:
-            pixels = run.size * len(found.y) > MANY_POINTS
-            axes.plot(found.x, run, color=style["color"], linewidth=0.6, alpha=0.35, zorder=1, rasterized=pixels)
+            axes.plot(found.x, run, color=style["color"], rasterized=found.y.size > MANY_POINTS, **faintness)
     marker = "o" if found.x.size == 1 else ""  # a line through one point would not be seen
     axes.plot(found.x, found.mean, linewidth=1.4, zorder=3, label=label, marker=marker, **style)
 
@@ -59,7 +59,9 @@ def plot_over_steps(
     drawn = False
     for index, record in enumerate(records):
         found = curves(record.episodes, "env_steps", column).averaged(episodes_in_a_point(record))
-        plot_curves(axes, found, label=prefix or record.name, faint=faint, **(style_of(index, len(records)) | style))
+        plot_curves(
+            axes, found, label=prefix or literal(record.name), faint=faint, **(style_of(index, len(records)) | style)
+        )
         drawn |= bool(found.x.size)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     return drawn
@@ -74,7 +76,7 @@ def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> Non
         style = style_of(index, len(records))
         found = curves(record.designs, "design", column)
         line = style | ({"color": GREY} if len(records) == 1 and len(found.y) == 1 else {})
-        plot_curves(axes, found, label=record.name, **line)
+        plot_curves(axes, found, label=literal(record.name), **line)
         means = dict(zip(found.x.tolist(), found.mean.tolist()))
         rows = {row["design"]: row | {column: means.get(row["design"], math.nan)} for row in record.designs}
         mark_kinds(axes, list(rows.values()), column, style["color"] if len(records) > 1 else None)
@@ -103,7 +105,9 @@ def explain(
 ) -> None:
     """A legend above the figure: folders where there are several, kinds of design where they are marked, the mean."""
     several = len(records) > 1
-    handles = [Line2D([], [], label=r.name, **style_of(i, len(records))) for i, r in enumerate(records) if several]
+    handles = [
+        Line2D([], [], label=literal(r.name), **style_of(i, len(records))) for i, r in enumerate(records) if several
+    ]
     if kinds:
         there = [row["kind"] for record in records for row in record.designs]
         handles += kind_handles(there, GREY if several else None)

@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 from coim import MorphEnv
 from recipes.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
 from recipes.curves import explain, mark_kinds, new_figure, plot_over_designs
-from recipes.palette import GREY, style_of
+from recipes.palette import GREY, literal, style_of
 from recipes.records import Record, Row, number
 
 MOST_BODIES = 64  # of one run; of more the best are drawn
@@ -92,7 +92,7 @@ def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
             run = _top(record)["run"]
             rows = sorted((row for row in record.designs if row["run"] == run and _known(row)), key=_best_return)
             best = rows[-(MOST_BODIES if len(records) == 1 else BODIES_COMPARED) :]
-            shown.append((f"{record.name}, run {run}", sorted(best, key=lambda row: row["design"])))
+            shown.append((f"{literal(record.name)}, run {run}", sorted(best, key=lambda row: row["design"])))
     if not shown:
         return Picture(title, "No design has a return yet.")
     caption = (

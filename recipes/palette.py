@@ -27,6 +27,11 @@ def style_of(index: int, count: int) -> dict[str, str]:
     return {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index // len(COLOURS) % len(DASHES)]}
 
 
+def literal(name: str) -> str:
+    """A folder's name as matplotlib draws it as it is: no formula between dollars, no underscore that hides it."""
+    return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
+
+
 def kind_handles(kinds: Iterable[str], colour: str | None = None) -> list[Line2D]:
     """Entries of a legend for kinds of design; ``colour`` overrules the kind's own."""
     there = set(kinds)

@@ -191,9 +191,12 @@ def test_bodies_that_are_not_ours_are_not_drawn(runs: Path, tmp_path: Path) -> N
     assert len(check(write_report([folder], body=HopperMorph)).images) == len(PICTURES)
 
 
-def test_names_are_words_and_not_tags(runs: Path, tmp_path: Path) -> None:
+def test_names_are_words_and_neither_tags_nor_formulas(runs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(runs / "one", tmp_path / "a <b> & 'c\"")
-    assert "a <b> & 'c\"" in check(write_report([folder])).words
+    formula = shutil.copytree(runs / "one", tmp_path / "_$x_{1$")
+    page = check(write_report([folder, formula]))
+    assert "a <b> & 'c\"" in page.words
+    assert "_$x_{1$" in page.words
 
 
 def test_what_is_no_run_gets_a_sentence(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
