@@ -1,0 +1,78 @@
+"""``python -m benchmarks``: one table of ratios, each measured side by side in one run, and the same as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+import tyro
+
+from benchmarks import table
+from benchmarks.bodies import bodies
+from benchmarks.effort import FULL, QUICK, Effort
+from benchmarks.iteration import iteration
+from benchmarks.measure import Figure
+from benchmarks.memory import memory
+from benchmarks.model import ensemble, imagination
+from benchmarks.rivals import sb3, sbx
+from benchmarks.search import search
+from benchmarks.updates import products, torchrl, update
+from recipes.machine import available_cores, prepare
+
+Row = Literal[
+    "products", "update", "torchrl", "sb3", "sbx", "ensemble", "imagination", "search", "bodies", "iteration", "memory"
+]
+ROWS: dict[Row, Callable[[Effort], list[Figure]]] = {
+    "products": products,
+    "update": update,
+    "torchrl": torchrl,
+    "sb3": sb3,
+    "sbx": sbx,
+    "ensemble": ensemble,
+    "imagination": imagination,
+    "search": search,
+    "bodies": bodies,
+    "iteration": iteration,
+    "memory": memory,
+}
+DEFAULT_OUT = Path("docs/results/benchmarks.json")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to measure."""
+
+    only: tuple[Row, ...] = get_args(Row)
+    """These rows alone."""
+    quick: bool = False
+    """Fewer repeats and smaller sizes: a first look, not a result."""
+    out: Path | None = None
+    """JSON file; by default docs/results/benchmarks.json for the whole table, and none for a part or a quick look."""
+
+
+def main(options: Options) -> None:
+    """Measure, print the table, write the file."""
+    prepare(available_cores(), torch.device("cpu"))
+    found = table.machine()
+    figures: list[Figure] = []
+    for name in options.only:
+        start = time.perf_counter()
+        figures += ROWS[name](QUICK if options.quick else FULL)
+        print(f"{name}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+    print(table.heading(found))
+    if options.quick:
+        print("a quick look: sizes are smaller than those that the targets are meant for")
+    print(table.text(figures))
+    whole = set(options.only) == set(ROWS) and not options.quick
+    out = options.out or (DEFAULT_OUT if whole else None)
+    if out is not None:
+        table.write(out, found, figures)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, prog="python -m benchmarks", description=__doc__))

@@ -1,0 +1,207 @@
+"""Rows: the products themselves, the update of policy and critics, and the same by stock TorchRL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from statistics import median
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from benchmarks.effort import Effort
+from benchmarks.floors import Product, alone, flop
+from benchmarks.measure import Figure, Target, interleaved, over, threads
+from benchmarks.parts import body_sizes, model_products, replay, sac_learner, update_products
+from coim import HalfCheetahMorph, TransitionBuffer, sample_batches
+from coim.learner import Precision
+from recipes.machine import available_cores
+
+FLOOR = "floor"
+PRODUCTS_BY = "{:.2f} x the same products by oneDNN"
+
+
+def products(effort: Effort) -> list[Figure]:
+    """What the two libraries make of the same products: why a ratio to the floor can fall below 1."""
+    found = []
+    lists = {
+        "an update": (update_products(effort), effort.updates),
+        "an ensemble update": (model_products(effort), max(1, effort.updates // 4)),
+    }
+    for count in effort.threads:
+        for name, (listed, times_over) in lists.items():
+            row = f"products of {name}, {plural(count)}, "
+            if count > available_cores():
+                found.append(Figure(row=row + "oneDNN", against=FLOOR, note=too_few_cores(count)))
+                continue
+            found += _libraries(row, listed, times_over, count, effort.repeats)
+    return found
+
+
+def _libraries(row: str, listed: Sequence[Product], times_over: int, count: int, repeats: int) -> list[Figure]:
+    with threads(count):
+        times = interleaved(
+            {
+                "mkl": alone(listed, times=times_over),
+                "float32": alone(listed, times=times_over, library="onednn"),
+                "bfloat16": alone(listed, times=times_over, library="onednn", dtype=torch.bfloat16),
+            },
+            repeats,
+        )
+    work = flop(listed) * times_over / 1e9
+    speed = {name: tuple(work / seconds for seconds in values) for name, values in times.items()}
+    ones = (1.0,) * repeats
+    return [
+        Figure(row=f"{row}MKL float32", against=FLOOR, ratios=ones, amounts=speed["mkl"], unit="GFLOP/s"),
+        *(
+            Figure(
+                row=f"{row}oneDNN {name}",
+                against=FLOOR,
+                ratios=over(times[name], times["mkl"]),
+                amounts=speed[name],
+                unit="GFLOP/s",
+            )
+            for name in ("float32", "bfloat16")
+        ),
+    ]
+
+
+def update(effort: Effort) -> list[Figure]:
+    """Sampling, gradients, Adam and target update of policy and critics."""
+    found = []
+    for count in effort.threads:
+        for runs in effort.runs:
+            if count > available_cores():
+                row = f"update, {plural(count)}, K = {runs}"
+                found.append(Figure(row=row, against=FLOOR, note=too_few_cores(count)))
+                continue
+            with threads(count):
+                found += _update(effort, count, runs)
+    return found
+
+
+def _update(effort: Effort, count: int, runs: int) -> list[Figure]:
+    updates = max(1, effort.updates // runs)
+    buffer, listed = replay(runs), update_products(effort)
+    candidates = {
+        "float32": our_updates(buffer, effort, runs, "float32", updates),
+        "bfloat16": our_updates(buffer, effort, runs, "bfloat16", updates),
+    }
+    floor, by_onednn = alone(listed, times=updates * runs), alone(listed, times=updates * runs, library="onednn")
+    times = interleaved({"floor": floor, "onednn": by_onednn, **candidates}, effort.repeats)
+    target = {"float32": Target(1.25 if count == 1 else 1.4), "bfloat16": Target(0.85) if count == 1 else None}
+    return [
+        Figure(
+            row=f"update, {plural(count)}, K = {runs}, {name}",
+            against=FLOOR if runs == 1 else f"{runs} floors",
+            ratios=over(times[name], times["floor"]),
+            amounts=tuple(1e3 * seconds / (updates * runs) for seconds in times[name]),
+            unit="ms per run",
+            target=target[name],
+            note=PRODUCTS_BY.format(median(over(times[name], times["onednn"]))) if name == "float32" else "",
+        )
+        for name in candidates
+    ]
+
+
+def our_updates(
+    buffer: TransitionBuffer, effort: Effort, runs: int, precision: Precision, updates: int
+) -> Callable[[], None]:
+    """So many updates as Algorithm 1 does them: all batches in one draw, then `SACLearner.update`."""
+    learner = sac_learner(effort, num_runs=runs, precision=precision)
+
+    def run() -> None:
+        batches = sample_batches(buffer, batch_size=effort.batch_size, num_batches=updates)
+        learner.update(batches[:, :, 0] if runs == 1 else batches)
+
+    return run
+
+
+def torchrl(effort: Effort) -> list[Figure]:
+    """TorchRL's own SACLoss, fused Adam and SoftUpdate, eager, on its own networks and the same rows."""
+    found = []
+    for count in effort.threads:
+        row = f"update, {plural(count)}, K = 1, float32"
+        if count > available_cores():
+            found.append(Figure(row=row, against="TorchRL", note=too_few_cores(count)))
+            continue
+        with threads(count):
+            buffer, updates = replay(1), max(1, effort.updates // 2)
+            times = interleaved(
+                {
+                    "floor": alone(update_products(effort), times=updates),
+                    "ours": our_updates(buffer, effort, 1, "float32", updates),
+                    "theirs": _torchrl_updates(buffer, effort, updates),
+                },
+                effort.repeats,
+            )
+        found.append(
+            Figure(
+                row=row,
+                against="TorchRL",
+                ratios=over(times["ours"], times["theirs"]),
+                amounts=tuple(1e3 * seconds / updates for seconds in times["ours"]),
+                unit="ms",
+                note=f"TorchRL is at {median(over(times['theirs'], times['floor'])):.2f} x floor",
+            )
+        )
+    return found
+
+
+def _torchrl_updates(buffer: TransitionBuffer, effort: Effort, updates: int) -> Callable[[], None]:
+    sizes = body_sizes(HalfCheetahMorph(seed=0))
+    states = sizes["observations"] + sizes["designs"]
+
+    def network(inputs: int, outputs: int) -> MLP:
+        return MLP(in_features=inputs, out_features=outputs, num_cells=effort.num_cells, activation_class=nn.ReLU)
+
+    actor = ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(network(states, 2 * sizes["actions"]), ["observation", "design"], ["parameters"]),
+            TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+    critic = ValueOperator(network(states + sizes["actions"], 1), in_keys=["observation", "action", "design"])
+    action_spec = HalfCheetahMorph(seed=0).action_spec_unbatched
+    loss = SACLoss(
+        actor,
+        critic,
+        num_qvalue_nets=2,
+        loss_function="l2",
+        alpha_init=0.01,
+        min_alpha=None,
+        fixed_alpha=True,
+        action_spec=action_spec,
+    )
+    loss.make_value_estimator(gamma=0.99)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=3e-4, fused=True)
+    targets = SoftUpdate(loss, tau=0.005)
+
+    def step(batch: TensorDictBase) -> None:
+        found = loss(batch)
+        optimiser.zero_grad()
+        (found["loss_actor"] + found["loss_qvalue"]).backward()
+        optimiser.step()
+        targets.step()
+
+    def run() -> None:
+        for batch in sample_batches(buffer, batch_size=effort.batch_size, num_batches=updates)[:, :, 0].unbind(0):
+            step(batch)
+
+    return run
+
+
+def plural(count: int) -> str:
+    """``1 thread``, ``2 threads``."""
+    return f"{count} thread" + "s" * (count > 1)
+
+
+def too_few_cores(count: int) -> str:
+    """Why a row is empty."""
+    return f"needs {count} cores, this process may use {available_cores()}"
