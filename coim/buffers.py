@@ -122,7 +122,7 @@ class TransitionBuffer(TensorDictReplayBuffer):
             batch_size = next(iter(rows.values())).shape[:2]
             self.extend(TensorDict(rows, batch_size).unflatten_keys("."))
         self.writer.load_state_dict(state_dict["writer"])
-        self._rng.set_state(state_dict["generator"])
+        self._rng.set_state(state_dict["generator"].clone())  # torch reads a view of a larger tensor wrongly
 
 
 @dataclass(frozen=True, kw_only=True)

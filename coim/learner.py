@@ -12,7 +12,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -110,6 +110,25 @@ class SACLearner:
         for state in self.optimiser.state.values():
             for moment in state.values():
                 moment.zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that coming updates depend on: weights, targets, moments, generator. Tensors are not copied."""
+        moments = dict(self.optimiser.state.get(self._weights, {}))
+        weights, targets = self._weights.detach(), self._targets
+        return {"weights": weights, "targets": targets, "moments": moments, "rng": self.rng.get_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the learner that :meth:`state_dict` was read from.
+
+        Raises:
+            ValueError: if that one's networks have other sizes; nothing is changed then.
+        """
+        own = {"weights": self._weights.detach(), "targets": self._targets}
+        check_sizes(own, state_dict)
+        for name, tensor in own.items():
+            tensor.copy_(state_dict[name])
+        load_moments(self.optimiser, self._weights, state_dict["moments"])
+        self.rng.set_state(state_dict["rng"].clone())  # torch reads a view of a larger tensor wrongly
 
     @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:
@@ -236,6 +255,34 @@ def same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
     if one is None or other is None:
         return one is other
     return all(torch.equal(a, b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
+
+
+def check_sizes(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
+    """Refuse a state of other networks before anything is copied."""
+    for name, tensor in own.items():
+        if given[name].shape != tensor.shape:
+            raise ValueError(
+                f"the state holds {given[name].numel()} {name}, this learner has {tensor.numel()}; make it with the "
+                "sizes, the number of critics or members and the number of runs that the state was saved with"
+            )
+
+
+def load_moments(optimiser: torch.optim.Optimizer, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
+    """Take the moments of an optimiser of one parameter; none are those of one that has seen nothing.
+
+    In place where there are some: a captured CUDA graph goes on writing to these very moments. Copied where there are
+    none: `torch.optim.Optimizer.load_state_dict` would share them with whoever gave them.
+    """
+    state = optimiser.state[parameter]
+    for moment in state.values():
+        moment.zero_()
+    for name, moment in moments.items():
+        if name in state:
+            state[name].copy_(moment)
+        else:
+            # Adam counts its steps on the CPU, unless it can be captured in a graph.
+            on_gpu = optimiser.defaults.get("capturable", False) or moment.ndim > 0
+            state[name] = moment.detach().to(parameter.device if on_gpu else "cpu", copy=True)
 
 
 def share_storage(tensors: Sequence[Tensor]) -> Tensor:
