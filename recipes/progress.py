@@ -17,17 +17,27 @@ class Progress:
         num_designs: M.
         total_episodes: of the whole run, for the time left.
         updates: network updates after each episode, for the speed.
+        done: episodes that were over before.
+        best: return of the present design before, if there is one.
         stream: where to write; None takes standard output.
         quiet: write nothing.
     """
 
     def __init__(
-        self, *, num_designs: int, total_episodes: int, updates: int, stream: TextIO | None = None, quiet: bool = False
+        self,
+        *,
+        num_designs: int,
+        total_episodes: int,
+        updates: int,
+        done: int = 0,
+        best: float = float("-inf"),
+        stream: TextIO | None = None,
+        quiet: bool = False,
     ) -> None:
-        self._num_designs, self._total, self._updates = num_designs, total_episodes, updates
+        self._num_designs, self._total, self._updates = num_designs, total_episodes - done, updates
         self._stream, self._quiet = stream or sys.stdout, quiet
         self._live = self._stream.isatty()
-        self._episodes, self._best, self._started = 0, float("-inf"), time.perf_counter()
+        self._episodes, self._best, self._started = 0, best, time.perf_counter()
 
     def show(self, event: DesignChosen | EpisodeDone | DesignDone) -> None:
         """Write the line of an episode; other events move the state only."""
