@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from coim.events import Kind
 
@@ -119,3 +120,31 @@ def _if_any(owner: object, method: str, *args: Any) -> Any:
     """Call a method that not every search has."""
     found = getattr(owner, method, None)
     return None if found is None else found(*args)
+
+
+def check_sizes(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
+    """Refuse a state of other networks before anything is copied."""
+    for name, tensor in own.items():
+        if given[name].shape != tensor.shape:
+            raise ValueError(
+                f"the state holds {given[name].numel()} {name}, this learner has {tensor.numel()}; make it with the "
+                "sizes, the number of critics or members and the number of runs that the state was saved with"
+            )
+
+
+def load_moments(optimiser: torch.optim.Optimizer, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
+    """Take the moments of an optimiser of one parameter; none are those of one that has seen nothing.
+
+    In place where there are some: a captured CUDA graph goes on writing to these very moments. Copied where there are
+    none: `torch.optim.Optimizer.load_state_dict` would share them with whoever gave them.
+    """
+    state = optimiser.state[parameter]
+    for moment in state.values():
+        moment.zero_()
+    for name, moment in moments.items():
+        if name in state:
+            state[name].copy_(moment)
+        else:
+            # Adam counts its steps on the CPU, unless it can be captured in a graph.
+            on_gpu = optimiser.defaults.get("capturable", False) or moment.ndim > 0
+            state[name] = moment.detach().to(parameter.device if on_gpu else "cpu", copy=True)

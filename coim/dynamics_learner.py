@@ -19,7 +19,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 
-from coim.learner import Precision, check_sizes, load_moments, share_storage, views
+from coim.continuation import check_sizes, load_moments
+from coim.learner import Precision, share_storage, views
 from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
 from coim.objectives.dynamics import EnsembleNLLLoss
 from coim.objectives.dynamics_gradients import dynamics_gradients

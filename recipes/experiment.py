@@ -76,12 +76,16 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
         print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners} -> {folder}")
-    try:
-        with locked(folder), stopping_at_once():
-            follow(algorithm, folder, name, settings)
-    except Stopped as stop:
-        print(f"\n{stop}; to go on: python -m recipes.{name} --resume {folder}", file=sys.stderr)
-        sys.exit(128 + stop.signum)
+    again = f"to go on: python -m recipes.{name} --resume {folder}"
+    with locked(folder):
+        try:
+            with stopping_at_once():
+                follow(algorithm, folder, name, settings)
+        except Stopped as stop:
+            print(f"\n{stop}; {again}", file=sys.stderr)
+            sys.exit(128 + stop.signum)
+        except OSError as error:  # a full disk, most likely
+            raise OSError(f"{error}; {again}") from error
     picture = draw_run(folder, body)
     if not settings.quiet:
         print(f"picture: {picture}")

@@ -211,8 +211,8 @@ def refuse_changes(old: Settings, new: Settings) -> None:
         )
     if new.num_designs < old.num_designs:
         raise ValueError(
-            f"num_designs was {old.num_designs} and can only grow, not shrink to {new.num_designs}; to end a run early, "
-            "stop it"
+            f"num_designs was {old.num_designs} and can only grow, not shrink to {new.num_designs}; to end a run "
+            "early, stop it"
         )
 
 

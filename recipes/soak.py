@@ -25,12 +25,13 @@ import tyro
 from coim import HopperMorph
 from recipes.experiment import main as main_of_recipe
 from recipes.experiment import run
+from recipes.results import Table
 from recipes.settings import Settings
 
 SMALL = Settings(
     num_designs=7,
-    first_episodes=2,
-    episodes=3,
+    first_episodes=1,
+    episodes=2,
     episode_steps=60,
     num_cells=(16, 16),
     model_cells=(16, 16),
@@ -67,8 +68,9 @@ class Soak:
 
 def main(soak: Soak) -> None:
     """Run, kill, resume, compare, write and print."""
-    draw = random.Random(soak.seed)
-    rows = []
+    draw, identical = random.Random(soak.seed), 0
+    soak.out.parent.mkdir(parents=True, exist_ok=True)
+    table = Table(soak.out, ["kill", "kind", "killed_after_s", "run_takes_s", "checkpoints_before", "identical"])
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         seconds = {kind: left_alone(folder / kind, settings) for kind, settings in KINDS.items()}
@@ -76,15 +78,13 @@ def main(soak: Soak) -> None:
             kind = list(KINDS)[i % len(KINDS)]
             moment = draw.uniform(0, seconds[kind])
             victim = folder / str(i)
-            had = killed_and_resumed(victim, KINDS[kind], moment)
+            before = killed_and_resumed(victim, KINDS[kind], moment)
             different = differences(folder / kind, victim)
-            rows.append([i + 1, kind, f"{moment:.3f}", f"{seconds[kind]:.3f}", had, not different])
-            print(*rows[-1], *different[:3], sep="  ", flush=True)
-    soak.out.parent.mkdir(parents=True, exist_ok=True)
-    with soak.out.open("w", newline="") as file:
-        head = ["kill", "kind", "killed_after_s", "run_takes_s", "checkpoints_before", "identical"]
-        csv.writer(file, lineterminator="\n").writerows([head, *rows])
-    print(f"{sum(row[-1] for row in rows)} of {len(rows)} identical")
+            identical += not different
+            row = [i + 1, kind, f"{moment:.3f}", f"{seconds[kind]:.3f}", before, not different]
+            table.append([row])
+            print(*row, *different[:3], sep="  ", flush=True)
+    print(f"{identical} of {soak.kills} identical")
 
 
 def left_alone(folder: Path, settings: Settings) -> float:
