@@ -85,8 +85,8 @@ class Checkpoints:
             ValueError: if there are checkpoints and none is whole, or it is one of another version or other sizes.
         """
         found = sorted(self.folder.glob(f"{PREFIX}-*"), reverse=True)
-        for path in self.folder.glob(".*"):
-            shutil.rmtree(path)  # what a process that was killed had not finished
+        for path in self.folder.glob(".*/"):
+            shutil.rmtree(path, ignore_errors=True)  # what a process that was killed had not finished
         damaged = []
         for path in found:
             if complaint := self._complaint(path):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from coim import DesignChosen, DesignDone, EpisodeDone
+from recipes.checkpoint import sync
 from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
 
@@ -207,6 +208,7 @@ def write_whole(path: Path, text: str) -> None:
         file.flush()
         os.fsync(file.fileno())
     os.replace(aside, path)
+    sync(path.parent)
 
 
 def now() -> str:
