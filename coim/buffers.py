@@ -115,14 +115,20 @@ class TransitionBuffer(TensorDictReplayBuffer):
         return {"rows": rows, "writer": self.writer.state_dict(), "generator": self._rng.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the place of the buffer that :meth:`state_dict` was read from."""
+        """Take the place of the buffer that :meth:`state_dict` was read from; this one may be larger."""
         self.empty()
-        rows: dict[str, torch.Tensor] = state_dict["rows"]
+        rows, writer = state_dict["rows"], dict(state_dict["writer"])
         if rows:
-            batch_size = next(iter(rows.values())).shape[:2]
-            self.extend(TensorDict(rows, batch_size).unflatten_keys("."))
-        self.writer.load_state_dict(state_dict["writer"])
-        self._rng.set_state(state_dict["generator"])
+            count = len(next(iter(rows.values())))
+            stored = TensorDict(rows, next(iter(rows.values())).shape[:2]).unflatten_keys(".")
+            if count < self.capacity and writer["_cursor"] < count:
+                # That one was full and about to overwrite its oldest row. There is room here: behind the newest.
+                stored = torch.cat([stored[writer["_cursor"] :], stored[: writer["_cursor"]]])
+                writer["_cursor"] = count
+            self.extend(stored)
+        writer["_cursor"] %= self.capacity
+        self.writer.load_state_dict(writer)
+        self._rng.set_state(state_dict["generator"].clone())  # torch reads a view of a larger tensor wrongly
 
 
 @dataclass(frozen=True, kw_only=True)

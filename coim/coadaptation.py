@@ -11,11 +11,12 @@ References:
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
+from coim.continuation import Trial, restore, state_of
 from coim.designs import DesignGenerator, DesignSearch, RandomDesigns
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
@@ -86,6 +88,9 @@ class CoAdaptation:
             have the wrong shape, or only one of ``dream`` and ``generator`` is given.
 
     Note:
+        Whoever stops at an event may come back to it: iterating again goes on with what comes next, and so does another
+        instance, made alike, that loads the `state_dict`. After an exception within the loop only the latter is sound.
+
         Evaluation episodes leave no trace in the replay. The predecessor's code also skips training in the first three
         episodes of a design and population training in the first designs; the paper has no such rule.
     """
@@ -156,31 +161,46 @@ class CoAdaptation:
         self.batch_size, self.num_start_states = batch_size, num_start_states
         self.imagined_rows = imagined_rows if imagined_rows is not None else self._rows_to_draw()
         self.index, self.env_steps = 0, 0
+        self.trial: Trial | None = None  # the body that is being tried
         seeds = torch.Generator().manual_seed(seed)
         # One generator for each reader and writer, so that nothing depends on who comes first.
-        self._rng = {
+        self.rngs = {
             name: torch.Generator(env.device or "cpu").manual_seed(int(torch.randint(2**62, (), generator=seeds)))
             for name in ("actions", "dream", "designs", "individual", "population", "model")
         }
         self.precision = precision
         self._beside = ThreadPoolExecutor(1, "coim-population") if side_by_side else None
+        self._abandoned = threading.Event()
 
     def __iter__(self) -> Iterator[Event]:
+        # All that is known of the loop changes before an event: who stops there, here or in another process with this
+        # one's state_dict, and comes back goes on with what would have come next.
         while self.index < self.num_designs:
-            kind, design, predicted = self._next_design()
-            yield DesignChosen(self.index, kind, design, predicted)
-            best = torch.full(self.env.batch_size, -torch.inf)
-            # Without the population's weights the individual networks would start each body from the last body's gait.
-            self.individual.start_from(self.population)
-            self.buffers.ind.empty()
-            self._refresh_imagined()
-            for episode in range(self._episodes_of(self.index)):
-                event = self._run_and_learn(kind, design, episode)
-                best = torch.maximum(best, event.evaluation_return.cpu())
+            if self.trial is None:
+                trial = self.trial = Trial(*self._next_design(), best=torch.full(self.env.batch_size, -torch.inf))
+                yield DesignChosen(self.index, trial.kind, trial.design, trial.predicted)
+            trial = self.trial
+            if trial.next_episode == 0:
+                # Without the population's weights the individual networks would start from the last body's gait.
+                self.individual.start_from(self.population)
+                self.buffers.ind.empty()
+                self._refresh_imagined()
+            while trial.next_episode < self._episodes_of(self.index):
+                event = self._run_and_learn(trial.kind, trial.design, trial.next_episode)
+                trial.best = torch.maximum(trial.best, event.evaluation_return.cpu())
+                trial.next_episode += 1
                 yield event
-            done = DesignDone(self.index, kind, design, best)
-            self.index += 1  # before the event: who stops there and comes back goes on with the next design
+            done = DesignDone(self.index, trial.kind, trial.design, trial.best)
+            self.index, self.trial = self.index + 1, None
             yield done
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the coming events depend on, between two events; see `coim.continuation.state_of`."""
+        return state_of(self)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the one that :meth:`state_dict` was read from; see `coim.continuation.restore`."""
+        restore(self, state_dict)
 
     def _episodes_of(self, index: int) -> int:
         return self.first_episodes if index < len(self.first_designs) else self.episodes
@@ -192,7 +212,7 @@ class CoAdaptation:
         with booked(seconds, "episode"):
             # Collect experience for the current design with pi_Ind.
             with booked(seconds, "collect"):
-                rows = run_episode(self.env, self.individual.policy, design=design, rng=self._rng["actions"])
+                rows = run_episode(self.env, self.individual.policy, design=design, rng=self.rngs["actions"])
                 self.buffers.ind.extend(rows)
                 self.buffers.pop.extend(rows)
             # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
@@ -230,7 +250,7 @@ class CoAdaptation:
         if self.dream is None or self.generator is None or len(self.buffers.pop) == 0:
             return
         states = self.buffers.pop.sample(self.imagined_rows)
-        rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self._rng["dream"])
+        rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self.rngs["dream"])
         self.buffers.art.extend(rows)
 
     def _rows_to_draw(self) -> int:
@@ -248,9 +268,17 @@ class CoAdaptation:
             parts = batch_parts(self.batch_size)
             return means | self._train("model", self.dynamics, parts, self.model_updates, seconds)
 
-        beside = None if self._beside is None else self._beside.submit(population_and_model)
-        means = self._train("individual", self.individual, self.individual_parts, self.individual_updates, seconds)
-        return means | (population_and_model() if beside is None else beside.result())
+        def individual() -> Means:
+            return self._train("individual", self.individual, self.individual_parts, self.individual_updates, seconds)
+
+        if self._beside is None:
+            return individual() | population_and_model()
+        beside = self._beside.submit(population_and_model)
+        try:
+            return individual() | beside.result()
+        except BaseException:
+            self._abandoned.set()  # a process that is told to end would wait for the other thread
+            raise
 
     def _train(
         self,
@@ -266,8 +294,10 @@ class CoAdaptation:
         means: Means = {}
         with booked(seconds, f"train {name}"):
             for done in range(0, updates, UPDATES_PER_SAMPLE):
+                if self._abandoned.is_set():
+                    raise RuntimeError("an update failed or was interrupted; go on from a state_dict of before")
                 count = min(UPDATES_PER_SAMPLE, updates - done)
-                batches = sample_mixture(sources, count, imagined=self.buffers.art, rng=self._rng[name])
+                batches = sample_mixture(sources, count, imagined=self.buffers.art, rng=self.rngs[name])
                 for key, value in learner.update(batches).items():
                     means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + value.cpu() * (count / updates)
         return means
@@ -284,7 +314,7 @@ class CoAdaptation:
         if since % 2 == 0:
             found = [self.search.maximise(fitness) for fitness in self._fitness()]
             return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
-        design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self._rng["designs"])
+        design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self.rngs["designs"])
         return "random", design, self._predict(design)
 
     def _fitness(self) -> list[DesignValue]:

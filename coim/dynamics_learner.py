@@ -11,11 +11,15 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 
+from coim.continuation import check_sizes, load_moments
 from coim.learner import Precision, share_storage, views
 from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
 from coim.objectives.dynamics import EnsembleNLLLoss
@@ -79,6 +83,28 @@ class DynamicsLearner:
     def observe(self, rows: TensorDictBase) -> None:
         """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets."""
         self.ensemble.update_statistics(rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that coming updates depend on: weights, moments, statistics. Tensors are not copied."""
+        return {
+            "weights": self._weights.detach(),
+            "moments": dict(self.optimiser.state.get(self._weights, {})),
+            "inputs": dict(self.ensemble.inputs.state_dict()),
+            "targets": dict(self.ensemble.targets.state_dict()),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the learner that :meth:`state_dict` was read from.
+
+        Raises:
+            ValueError: if that one's ensemble has other sizes; nothing is changed then.
+        """
+        weights = self._weights.detach()
+        check_sizes({"weights": weights}, state_dict)
+        weights.copy_(state_dict["weights"])
+        load_moments(self.optimiser, self._weights, state_dict["moments"])
+        self.ensemble.inputs.load_state_dict(state_dict["inputs"])
+        self.ensemble.targets.load_state_dict(state_dict["targets"])
 
     @torch.no_grad()
     def error(self, rows: TensorDictBase) -> Tensor:

@@ -12,7 +12,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -21,6 +21,7 @@ from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
+from coim.continuation import check_sizes, load_moments
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
 from coim.models.scaling import InputScaling
@@ -110,6 +111,25 @@ class SACLearner:
         for state in self.optimiser.state.values():
             for moment in state.values():
                 moment.zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that coming updates depend on: weights, targets, moments, generator. Tensors are not copied."""
+        moments = dict(self.optimiser.state.get(self._weights, {}))
+        weights, targets = self._weights.detach(), self._targets
+        return {"weights": weights, "targets": targets, "moments": moments, "rng": self.rng.get_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the learner that :meth:`state_dict` was read from.
+
+        Raises:
+            ValueError: if that one's networks have other sizes; nothing is changed then.
+        """
+        own = {"weights": self._weights.detach(), "targets": self._targets}
+        check_sizes(own, state_dict)
+        for name, tensor in own.items():
+            tensor.copy_(state_dict[name])
+        load_moments(self.optimiser, self._weights, state_dict["moments"])
+        self.rng.set_state(state_dict["rng"].clone())  # torch reads a view of a larger tensor wrongly
 
     @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import sys
 import time
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 from coim import (
     Buffers,
     CoAdaptation,
+    DesignChosen,
     DynamicsLearner,
     EpisodeDone,
     Event,
@@ -31,19 +33,21 @@ from coim import (
 )
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
+from recipes.checkpoint import Checkpoints
+from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.pictures import draw_run
 from recipes.progress import Progress
 from recipes.report import write_report
-from recipes.results import Results, default_folder, describe
-from recipes.settings import Settings, episodes_of, parse
+from recipes.results import Results, default_folder, describe, refuse_filled, versions
+from recipes.settings import Settings, episodes_of, parse, read_config
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
     """Command line of one environment's recipe."""
-    settings = parse(f"python -m recipes.{name}", f"Co-adapt {body.__name__}: body and controller together.", arguments)
+    program, description = f"python -m recipes.{name}", f"Co-adapt {body.__name__}: body and controller together."
     try:
-        run(body, name, settings)
+        run(body, name, parse(program, description, arguments))
     except (ValueError, OSError) as error:
         sys.exit(f"{type(error).__name__}: {error}")
 
@@ -54,16 +58,47 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
     Args:
         body: the environment.
         name: of the environment, the first part of the folder's name.
-        settings: everything else.
+        settings: everything else; ``resume`` names the folder of a run to go on with.
 
     Returns:
         The folder.
+
+    Raises:
+        SystemExit: on Ctrl-C or SIGTERM, after the line that resumes the run.
     """
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
+    folder = settings.resume or settings.out or default_folder(name, settings)
+    if settings.resume is None:
+        refuse_filled(folder)
+    else:
+        check_origin(folder, name)
     algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
-    folder = settings.out or default_folder(name, settings)
-    results = Results(folder, name, settings, algorithm.env.design_spec.shape[0])
+    if not settings.quiet:
+        learners = "learners side by side, one thread each" if side_by_side else "one thread"
+        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners} -> {folder}")
+    again = f"to go on: python -m recipes.{name} --resume {folder}"
+    with locked(folder):
+        try:
+            with stopping_at_once():
+                follow(algorithm, folder, name, settings)
+        except Stopped as stop:
+            print(f"\n{stop}; {again}", file=sys.stderr)
+            sys.exit(128 + stop.signum)
+        except OSError as error:  # a full disk, most likely
+            raise OSError(f"{error}; {again}") from error
+    picture, report = draw_run(folder, body), write_report([folder], body=body)
+    if not settings.quiet:
+        print(f"picture: {picture}\nreport: {report}")
+    return folder
+
+
+def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings) -> None:
+    """Iterate, from the start or from the last checkpoint: write, show and log each event, and save between them."""
+    checkpoints = Checkpoints(folder, algorithm)
+    notes = checkpoints.load() if settings.resume is not None else None
+    trial = algorithm.trial
+    results = Results(folder, name, settings, algorithm.env.design_spec.shape[0], notes=notes)
     progress = Progress(
         num_designs=settings.num_designs,
         total_episodes=sum(episodes_of(settings, index) for index in range(settings.num_designs)),
@@ -71,24 +106,36 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
         + settings.population_updates
         + settings.model_updates * (settings.designs != "none"),
         imagined_share=algorithm.population_parts.imagined / settings.batch_size,
+        done=notes["rows"]["evaluations"] // settings.num_runs if notes else 0,
+        best=float("-inf") if trial is None else float(trial.best.mean()),
         quiet=settings.quiet,
     )
     logger = open_wandb(folder, name, settings)
-    if not settings.quiet:
-        learners = "learners side by side, one thread each" if side_by_side else "one thread"
-        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners} -> {folder}")
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)
         progress.show(event)
         if logger is not None:
             log(logger, event, num_runs=settings.num_runs)
+        # A chosen design is saved too: the swarm takes as long as an episode.
+        chosen = isinstance(event, DesignChosen)
+        if chosen or (isinstance(event, EpisodeDone) and (event.episode + 1) % settings.checkpoint_every == 0):
+            checkpoints.save(results.notes())
     progress.end()
-    picture, report = draw_run(folder, body), write_report([folder], body=body)
     if not settings.quiet:
         print(results.table())
-        print(f"picture: {picture}\nreport: {report}")
-    return folder
+
+
+def check_origin(folder: Path, name: str) -> None:
+    """Refuse a run of another environment, and warn of other versions than those that it began with."""
+    config = read_config(folder)
+    if config["environment"] != name:
+        raise ValueError(f"{folder} holds a run of {config['environment']}: python -m recipes.{config['environment']}")
+    present = versions()
+    for package, version in config["versions"].items():
+        if present.get(package) != version:
+            now = present.get(package)
+            print(f"warning: {package} was {version} and is {now}; the numbers may differ from here", file=sys.stderr)
 
 
 def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by_side: bool = False) -> CoAdaptation:
@@ -97,6 +144,9 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
     # Streams of one seed that have nothing in common, nor with those of the next seed.
     seeds = iter(np.random.SeedSequence(settings.seed).generate_state(8).tolist())
     torch.manual_seed(next(seeds))  # initial weights
+    # Nothing of ours draws from these two. What somebody plugs in may, and shall repeat as well.
+    random.seed(settings.seed)
+    np.random.seed(settings.seed % 2**32)  # noqa: NPY002
 
     def bodies() -> MorphEnv:
         return body(

@@ -22,6 +22,8 @@ class Progress:
         total_episodes: of the whole run, for the time left.
         updates: network updates after each episode, for the speed.
         imagined_share: of a population batch.
+        done: episodes that were over before.
+        best: return of the present design before, if there is one.
         stream: where to write; None takes standard output.
         quiet: write nothing.
     """
@@ -33,14 +35,16 @@ class Progress:
         total_episodes: int,
         updates: int,
         imagined_share: float = 0.0,
+        done: int = 0,
+        best: float = -math.inf,
         stream: TextIO | None = None,
         quiet: bool = False,
     ) -> None:
-        self._num_designs, self._total, self._updates = num_designs, total_episodes, updates
+        self._num_designs, self._total, self._updates = num_designs, total_episodes - done, updates
         self._imagined_share = imagined_share
         self._stream, self._quiet = stream or sys.stdout, quiet
         self._live = self._stream.isatty()
-        self._episodes, self._best, self._started = 0, -math.inf, time.perf_counter()
+        self._episodes, self._best, self._started = 0, best, time.perf_counter()
 
     def show(self, event: DesignChosen | EpisodeDone | DesignDone) -> None:
         """Write the line of an episode; other events move the state only."""

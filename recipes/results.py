@@ -1,4 +1,4 @@
-"""A run's folder: the settings, and three CSV files that grow."""
+"""A run's folder: the settings, and three CSV files that grow; new, or gone on with."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import csv
 import dataclasses
 import datetime
 import json
+import os
 import platform
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from coim import DesignChosen, DesignDone, EpisodeDone
-from recipes.settings import Settings
+from recipes.checkpoint import sync
+from recipes.interrupt import LOCK
+from recipes.settings import Settings, changes, plain, read_config, saved_settings
 
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
 
@@ -27,20 +30,35 @@ class Results:
     Args:
         folder: made if it does not exist.
         environment: name of the body, for ``config.json``.
-        settings: of the run, for ``config.json``.
+        settings: of the run, for ``config.json``. With ``settings.resume`` the folder is gone on with: rows that came
+            after the checkpoint are dropped, they will come again.
         design_size: D.
+        notes: the `notes` of the checkpoint that is gone on from; without them the files start anew.
 
     Raises:
-        FileExistsError: if the folder already holds anything; nothing in it is touched.
+        FileExistsError: if the folder of a new run already holds anything; nothing in it is touched.
+        ValueError: if a CSV file has fewer rows than there were at the checkpoint.
     """
 
-    def __init__(self, folder: Path, environment: str, settings: Settings, design_size: int) -> None:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise FileExistsError(f"{folder} already holds something; name another folder with --out, or move it away")
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(
+        self,
+        folder: Path,
+        environment: str,
+        settings: Settings,
+        design_size: int,
+        *,
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
         self.folder = folder
-        self._predicted: Sequence[float | None] = []
-        (folder / "config.json").write_text(json.dumps(describe(environment, settings), indent=2) + "\n")
+        self._predicted: Sequence[float | None] = notes["predicted"] if notes else []
+        self._seconds = self._seconds_before = notes["seconds"] if notes else 0.0
+        rows = notes["rows"] if notes else {}
+        if settings.resume is None:
+            refuse_filled(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(folder / "config.json", json.dumps(describe(environment, settings), indent=2) + "\n")
+        else:
+            note_resumption(folder, settings)
         xi = [f"xi_{i + 1}" for i in range(design_size)]
         self._evaluations = Table(
             folder / "evaluations.csv",
@@ -56,12 +74,19 @@ class Results:
                 "model_error",
                 "seconds",
             ],
+            keep=rows.get("evaluations"),
         )
-        self._designs = Table(folder / "designs.csv", ["run", "design", "kind", *xi, "predicted", "best_return"])
+        self._designs = Table(
+            folder / "designs.csv",
+            ["run", "design", "kind", *xi, "predicted", "best_return"],
+            keep=rows.get("designs"),
+        )
         self._metrics: Table | None = None  # its columns are known when the first episode is done
+        self._metrics_rows = rows.get("metrics", 0)
 
     def write(self, event: DesignChosen | EpisodeDone | DesignDone, seconds: float) -> None:
-        """Append the rows of one event; ``seconds`` is the wall-clock of the run so far."""
+        """Append the rows of one event; ``seconds`` is the wall-clock since this process took the run up."""
+        seconds = self._seconds = self._seconds_before + seconds
         if isinstance(event, DesignChosen):
             nothing = [None] * len(event.design)
             self._predicted = nothing if event.predicted is None else event.predicted.tolist()
@@ -86,7 +111,7 @@ class Results:
         """Append what was measured while learning; ``seconds`` are of all runs together, the same in each row."""
         if self._metrics is None:
             columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in event.seconds)]
-            self._metrics = Table(self.folder / "metrics.csv", columns)
+            self._metrics = Table(self.folder / "metrics.csv", columns, keep=self._metrics_rows or None)
         seconds = list(event.seconds.values())
         self._metrics.append(
             [
@@ -98,6 +123,16 @@ class Results:
             ]
             for run in range(len(event.design))
         )
+        self._metrics_rows = self._metrics.num_rows
+
+    def notes(self) -> dict[str, Any]:
+        """What a checkpoint must know to let the files grow on; plain JSON."""
+        rows = {
+            "evaluations": self._evaluations.num_rows,
+            "designs": self._designs.num_rows,
+            "metrics": self._metrics_rows,
+        }
+        return {"rows": rows, "predicted": list(self._predicted), "seconds": self._seconds}
 
     def table(self) -> str:
         """The designs and their best returns, for a terminal."""
@@ -106,16 +141,37 @@ class Results:
 
 
 class Table:
-    """A CSV file that grows; every append is on disk before the next line of the program."""
+    """A CSV file that grows; every append is on disk before the next line of the program.
 
-    def __init__(self, path: Path, columns: list[str]) -> None:
-        self.path = path
-        with path.open("w", newline="") as file:
-            csv.writer(file).writerow(columns)
+    Args:
+        path: of the file.
+        columns: their names.
+        keep: rows of an existing file that stay; None begins a new one.
+
+    Raises:
+        ValueError: if the existing file has fewer rows, or other columns.
+    """
+
+    def __init__(self, path: Path, columns: list[str], *, keep: int | None = None) -> None:
+        self.path, self.num_rows = path, keep or 0
+        if keep is None:
+            write_whole(path, ",".join(columns) + "\n")
+            return
+        with path.open(newline="") as file:
+            lines = file.read().splitlines()
+        if lines[:1] != [",".join(columns)]:
+            raise ValueError(f"{path} has other columns than {columns}; go on with the version in config.json")
+        if len(lines) <= keep:
+            raise ValueError(f"{path} has {len(lines) - 1} rows, the checkpoint was made after {keep}; put them back")
+        write_whole(path, "\n".join(lines[: 1 + keep]) + "\n")
 
     def append(self, rows: Iterable[Sequence[Any]]) -> None:
+        cells = [[_cell(value) for value in row] for row in rows]
         with self.path.open("a", newline="") as file:
-            csv.writer(file).writerows([[_cell(value) for value in row] for row in rows])
+            csv.writer(file, lineterminator="\n").writerows(cells)
+            file.flush()
+            os.fsync(file.fileno())
+        self.num_rows += len(cells)
 
 
 def format_row(row: Sequence[str]) -> str:
@@ -134,20 +190,55 @@ def _cell(value: Any) -> Any:
     return f"{value:.7g}" if isinstance(value, float) else "" if value is None else value
 
 
+def versions() -> dict[str, str]:
+    """Of everything that decides about the numbers."""
+    return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+
+
 def describe(environment: str, settings: Settings) -> dict[str, Any]:
     """Everything that somebody needs to repeat the run."""
     return {
         "environment": environment,
-        "settings": {key: _plain(value) for key, value in dataclasses.asdict(settings).items()},
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES},
+        "settings": plain(settings),
+        "versions": versions(),
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
         "revision": git_revision(),
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "started": now(),
     }
 
 
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else value
+def note_resumption(folder: Path, settings: Settings) -> None:
+    """Write into ``config.json`` that the run went on, when, and with which other settings."""
+    config = read_config(folder)
+    moved = changes(saved_settings(folder), settings)
+    config["settings"] = plain(dataclasses.replace(settings, resume=None))
+    config["resumed"] = [*config.get("resumed", []), {"at": now(), "changed": moved}]
+    write_whole(folder / "config.json", json.dumps(config, indent=2) + "\n")
+
+
+def refuse_filled(folder: Path) -> None:
+    """Leave a folder alone that holds anything but our own lock."""
+    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
+        raise FileExistsError(
+            f"{folder} already holds something; name another folder with --out, move it away, or go on with the run in "
+            f"it by --resume {folder}"
+        )
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that it has either its old contents or the new ones, whatever happens."""
+    aside = path.with_name(f".{path.name}.new")
+    with aside.open("w", newline="") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, path)
+    sync(path.parent)
+
+
+def now() -> str:
+    """The time in UTC, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def git_revision() -> str | None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -102,6 +103,10 @@ class Settings:
     """Threads that may be busy at once; 0 takes one for each core that this process may use."""
     out: Path | None = None
     """Folder for the results; by default runs/ENVIRONMENT-DATE-NAME."""
+    resume: Path | None = None
+    """Go on with the run in this folder from its last checkpoint; its settings are read there."""
+    checkpoint_every: int = 1
+    """Episodes between two checkpoints."""
     name: str = "run"
     """Last part of the default folder's name."""
     wandb: Literal["off", "offline", "online"] = "off"
@@ -123,6 +128,8 @@ QUICK = Settings(
     name="quick",
 )
 
+# What may differ when a run is gone on with, because no number of its past depends on it.
+FREE = {"num_designs", "threads", "checkpoint_every", "resume", "wandb", "quiet"}
 PRESETS = {"paper": Settings(), "quick": QUICK}
 
 
@@ -136,17 +143,77 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
 
     Raises:
         SystemExit: on an unknown option or value, with a sentence on standard error.
+        ValueError: if the folder to resume holds no run, or a setting was changed that its past depends on.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="paper")
-    preset = first.parse_known_args(arguments)[0].preset
-    default = PRESETS.get(preset, PRESETS["paper"])  # an unknown name is refused below, with the names that exist
+    first.add_argument("--resume", type=Path)
+    known = first.parse_known_args(arguments)[0]
+    default = PRESETS.get(known.preset, PRESETS["paper"])  # an unknown name is refused below, with those that exist
+    if known.resume is not None:
+        default = saved_settings(known.resume)
     settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
     if settings.seed < 0:
         first.error(f"--seed is {settings.seed}, it must be at least 0")
     if settings.sigma < 0:
         first.error(f"--sigma is {settings.sigma}, a standard deviation is at least 0")
+    if settings.checkpoint_every < 1:
+        first.error(f"--checkpoint-every is {settings.checkpoint_every}, it must be at least 1")
+    if known.resume is not None:
+        refuse_changes(default, settings)
     return settings
+
+
+def plain(settings: Settings) -> dict[str, Any]:
+    """Settings as JSON has them."""
+    return {key: str(v) if isinstance(v, Path) else v for key, v in dataclasses.asdict(settings).items()}
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """``config.json`` of a run's folder."""
+    try:
+        return json.loads((folder / "config.json").read_text())
+    except OSError as error:
+        raise ValueError(f"{folder} holds no run: {folder / 'config.json'} cannot be read ({error.strerror})") from None
+
+
+def saved_settings(folder: Path) -> Settings:
+    """The settings of the run in a folder.
+
+    Raises:
+        ValueError: if there is none, or one of a version that had other settings.
+    """
+    saved = read_config(folder)["settings"]
+    fields = {field.name for field in dataclasses.fields(Settings)}
+    if other := sorted(fields ^ saved.keys()):
+        raise ValueError(
+            f"{folder} was made by a version with other settings: {', '.join(other)}; go on with the version in its "
+            "config.json"
+        )
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in saved.items()}
+    return Settings(**values | {"out": Path(saved["out"]) if saved["out"] else None})
+
+
+def changes(old: Settings, new: Settings) -> dict[str, list[Any]]:
+    """Settings that differ, old and new value; where a run is resumed from is no setting of it."""
+    one, other = plain(old), plain(new)
+    return {name: [one[name], other[name]] for name in one if one[name] != other[name] and name != "resume"}
+
+
+def refuse_changes(old: Settings, new: Settings) -> None:
+    """Refuse by name what cannot be changed in the middle of a run."""
+    fixed = {name: values for name, values in changes(old, new).items() if name not in FREE}
+    if fixed:
+        told = ", ".join(f"{name} ({was!r} to {wanted!r})" for name, (was, wanted) in fixed.items())
+        raise ValueError(
+            f"the run in {new.resume} has begun with other settings: {told}; leave them, or start a new run. "
+            f"Free to change are {', '.join(sorted(FREE - {'resume'}))}"
+        )
+    if new.num_designs < old.num_designs:
+        raise ValueError(
+            f"num_designs was {old.num_designs} and can only grow, not shrink to {new.num_designs}; to end a run "
+            "early, stop it"
+        )
 
 
 def episodes_of(settings: Settings, index: int, *, num_first: int = 5) -> int:

@@ -132,3 +132,16 @@ def test_rows_that_do_not_fit_are_refused() -> None:
         buffer.extend(make_rows(6, 2))
     with pytest.raises(ValueError, match="a buffer of 0 rows"):
         TransitionBuffer(0, seed=0)
+
+
+@pytest.mark.parametrize(("stored", "capacity"), [(4, 9), (6, 9), (8, 9), (8, 6), (4, 6)])
+def test_a_larger_buffer_goes_on_behind_the_newest_row(stored: int, capacity: int) -> None:
+    small, large = TransitionBuffer(6, seed=0), TransitionBuffer(capacity, seed=1)
+    for t in range(stored):
+        small.extend(make_rows(1, first=float(t)))
+    large.load_state_dict(small.state_dict())
+    large.extend(make_rows(1, first=100.0))
+    assert sorted(large[:]["observation"][:, 0, 0].tolist()) == [
+        *range(max(0, stored - 6, stored - capacity + 1), stored),
+        100.0,
+    ]

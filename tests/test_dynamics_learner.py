@@ -181,3 +181,22 @@ def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> N
         DynamicsLearner(ensemble, num_runs=num_runs).update(batches.to(device))
         ensembles.append(ensemble.cpu())
     assert_equal_weights(ensembles[1], ensembles[0], torch.float64)
+
+
+@pytest.mark.parametrize("num_runs", [None, 3])
+def test_a_learner_goes_on_where_another_stood(make_rows: Rows, num_runs: int | None) -> None:
+    batches = make_rows(3, 8, *([num_runs] if num_runs else []))
+    one, other = (
+        DynamicsLearner(
+            GaussianEnsemble.for_env(ToyEnv(), num_cells=(16,), num_runs=num_runs).double(), num_runs=num_runs
+        )
+        for _ in range(2)
+    )
+    one.observe(batches[0])
+    one.update(batches)
+    other.load_state_dict(deepcopy(one.state_dict()))
+    for learner in (one, other):
+        learner.observe(batches[1])
+        learner.update(batches)
+    for key, value in one.ensemble.state_dict().items():
+        assert torch.equal(other.ensemble.state_dict()[key], value), key

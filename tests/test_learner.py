@@ -110,6 +110,35 @@ def test_the_policy_that_acts_is_the_one_that_learns(make_rows: Rows) -> None:
     assert not torch.equal(learner.policy.network(observation, design)[0], before)
 
 
+@pytest.mark.parametrize("num_runs", [None, 3])
+def test_a_learner_goes_on_where_another_stood(make_rows: Rows, num_runs: int | None) -> None:
+    shape = [num_runs] if num_runs else []
+    one, other, fresh = (sac_learner(num_runs, seed=seed) for seed in (1, 2, 3))
+    one.update(make_rows(3, 8, *shape, seed=1))
+    other.update(make_rows(2, 8, *shape, seed=2))
+    # A captured CUDA graph goes on reading and writing these very tensors.
+    places = {key: value.data_ptr() for key, value in other.state_dict()["moments"].items()}
+    state = deepcopy(one.state_dict())
+    for learner in (other, fresh):
+        learner.load_state_dict(state)
+    assert {key: value.data_ptr() for key, value in other.state_dict()["moments"].items()} == places
+    for learner in (one, other, fresh):
+        learner.update(make_rows(3, 8, *shape, seed=4))
+    for key, value in weights(one).items():
+        assert torch.equal(weights(other)[key], value), key
+        assert torch.equal(weights(fresh)[key], value), key
+
+
+def test_a_learner_can_go_on_from_one_that_has_learnt_nothing(make_rows: Rows) -> None:
+    untouched, used = sac_learner(seed=1), sac_learner(seed=2)
+    used.update(make_rows(3, 8))
+    used.load_state_dict(untouched.state_dict())
+    for learner in (untouched, used):
+        learner.update(make_rows(2, 8))
+    for key, value in weights(untouched).items():
+        assert torch.equal(weights(used)[key], value), key
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("num_runs", [None, 3])
 def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> None:

@@ -101,7 +101,7 @@ class GradientSearch:
 
     def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
         """Go on with the random numbers of :meth:`state_dict`."""
-        self._rng.set_state(state_dict["rng"])
+        self._rng.set_state(state_dict["rng"].clone())  # torch reads a view of a larger tensor wrongly
 
 
 def _with_gradient(fitness: Fitness, designs: Tensor) -> tuple[Tensor, Tensor]:

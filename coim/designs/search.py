@@ -17,7 +17,11 @@ Fitness = Callable[[Tensor], Tensor]
 
 
 class DesignSearch(Protocol):
-    """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`."""
+    """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`.
+
+    One whose random numbers go on from call to call also needs ``state_dict`` and ``load_state_dict``: without them a
+    run that is resumed draws others than the run that was never stopped.
+    """
 
     def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:
         """Return the best design ``[D]`` found and its fitness; ``fitness`` maps ``[P, D]`` to ``[P]``."""

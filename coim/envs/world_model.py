@@ -48,6 +48,9 @@ class WorldModelEnv(EnvBase):
         batch_size: of the dream, ``[*B]``: free to differ from ``env``'s, but a fleet of models has its run axis last.
         seed: of the dream's own random numbers (TS1, noise, made-up starts). Drawn from torch if unset.
 
+    Attributes:
+        rng: the dream's own generator; its state is all that a dream carries from one call of `advance` to the next.
+
     Raises:
         ValueError: if a start state has an entry that is not finite, or a design that leaves the bounds.
 
@@ -66,7 +69,7 @@ class WorldModelEnv(EnvBase):
         self.reward_fn = env.reward_fn
         self.design_spec: Bounded = env.design_spec
         self._make_specs(env)
-        self._rng = torch.Generator(self.device or "cpu")
+        self.rng = torch.Generator(self.device or "cpu")
         self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
         self._start = TensorDict({}, self.batch_size, device=self.device)
 
@@ -84,7 +87,7 @@ class WorldModelEnv(EnvBase):
         Returns:
             Next observation ``[*B, S]`` and reward ``[*B, 1]``.
         """
-        rng = self._rng if generator is None else generator
+        rng = self.rng if generator is None else generator
         next_observation = self.ensemble.sample(observation, action, design, generator=rng)
         return next_observation, self.reward_fn(observation, action, next_observation, design)
 
@@ -106,7 +109,7 @@ class WorldModelEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._rng.manual_seed(seed)
+            self.rng.manual_seed(seed)
 
     def _make_specs(self, env: EnvBase) -> None:
         """Give each of the real environment's specs the dream's batch size."""
@@ -124,8 +127,8 @@ class WorldModelEnv(EnvBase):
         low, high = self.design_spec.space.low, self.design_spec.space.high
         observation = self.observation_spec["observation"].zero()
         design = self.observation_spec["design"].zero()
-        uniform = torch.rand(design.shape, generator=self._rng, device=design.device, dtype=design.dtype)
-        start = {"observation": observation.normal_(generator=self._rng), "design": low + (high - low) * uniform}
+        uniform = torch.rand(design.shape, generator=self.rng, device=design.device, dtype=design.dtype)
+        start = {"observation": observation.normal_(generator=self.rng), "design": low + (high - low) * uniform}
         return TensorDict(start, self.batch_size, device=self.device)
 
     def _check_start(self, start: TensorDictBase) -> None:

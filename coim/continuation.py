@@ -1,0 +1,150 @@
+"""What Algorithm 1 must remember to go on as if it had never stopped.
+
+Shapes: K runs, D design.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Algorithm 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from coim.events import Kind
+
+if TYPE_CHECKING:
+    from coim.coadaptation import CoAdaptation
+
+
+@dataclass
+class Trial:
+    """A body that is being tried: where the algorithm stands between two of its events.
+
+    Attributes:
+        kind: of the design.
+        design: ``[K, D]``.
+        predicted: Eq. 5 at this design when it was chosen, ``[K]``, or None.
+        best: highest evaluation return so far, ``[K]``.
+        next_episode: episodes that are over; with 0 the individual learner has not started yet.
+    """
+
+    kind: Kind
+    design: Tensor
+    predicted: Tensor | None
+    best: Tensor
+    next_episode: int = 0
+
+
+def state_of(algorithm: CoAdaptation) -> dict[str, Any]:
+    """All that the coming events depend on, read between two events.
+
+    Args:
+        algorithm: which is not running.
+
+    Returns:
+        Numbers, strings, tensors and dicts of them, as `torch.load` reads them with ``weights_only``. Tensors are not
+        copied: save them or copy them before the next event.
+
+    Note:
+        Torch's, numpy's and Python's global generators are not in it. Nothing here draws from them, but a foreign
+        policy or search may. A search without ``state_dict`` is taken to have no state.
+
+    Example:
+        >>> state = state_of(algorithm)  # doctest: +SKIP
+        >>> sorted(state["buffers"])  # doctest: +SKIP
+        ['art', 'ind', 'pop', 's0']
+    """
+    return {
+        "position": {
+            "index": algorithm.index,
+            "env_steps": algorithm.env_steps,
+            "trial": None if algorithm.trial is None else dict(vars(algorithm.trial)),
+        },
+        "rngs": {name: rng.get_state() for name, rng in algorithm.rngs.items()},
+        "env": algorithm.env.get_simulation_state().to_dict(),
+        "evaluation_env": algorithm.evaluation_env.get_simulation_state().to_dict(),
+        "population": algorithm.population.state_dict(),
+        "individual": algorithm.individual.state_dict(),
+        "dynamics": None if algorithm.dynamics is None else algorithm.dynamics.state_dict(),
+        "dream": None if algorithm.dream is None else algorithm.dream.rng.get_state(),
+        "search": _if_any(algorithm.search, "state_dict"),
+        "buffers": algorithm.buffers.state_dict(),
+    }
+
+
+def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
+    """Let an algorithm go on, event by event and bit by bit, as the one whose state was taken.
+
+    Args:
+        algorithm: made of the same parts with the same settings; only ``num_designs`` may differ, and how many threads
+            there are.
+        state: of `state_of`; left as it is, and nothing of it is shared.
+
+    Raises:
+        ValueError: if the two do not have the same parts or the same sizes.
+    """
+    for part in ("dynamics", "dream"):
+        if (state[part] is None) != (getattr(algorithm, part) is None):
+            raise ValueError(f"one of the state and the algorithm has a {part} and the other has none; make it alike")
+    algorithm.population.load_state_dict(state["population"])
+    algorithm.individual.load_state_dict(state["individual"])
+    if algorithm.dynamics is not None:
+        algorithm.dynamics.load_state_dict(state["dynamics"])
+    if algorithm.dream is not None:
+        algorithm.dream.rng.set_state(state["dream"].clone())  # torch reads a view of a larger tensor wrongly
+    for name in ("env", "evaluation_env"):
+        env = getattr(algorithm, name)
+        env.set_simulation_state(TensorDict(state[name], state[name]["design"].shape[:1]))
+    for name, rng in algorithm.rngs.items():
+        rng.set_state(state["rngs"][name].clone())
+    if state["search"] is not None:
+        _if_any(algorithm.search, "load_state_dict", state["search"])
+    algorithm.buffers.load_state_dict(state["buffers"])
+    position = state["position"]
+    algorithm.index, algorithm.env_steps = position["index"], position["env_steps"]
+    algorithm.trial = None if position["trial"] is None else _trial(position["trial"], algorithm)
+
+
+def _trial(saved: Mapping[str, Any], algorithm: CoAdaptation) -> Trial:
+    """A trial of its own, the design on the bodies' device."""
+    return Trial(**{**saved, "design": saved["design"].to(algorithm.env.device), "best": saved["best"].clone()})
+
+
+def _if_any(owner: object, method: str, *args: Any) -> Any:
+    """Call a method that not every search has."""
+    found = getattr(owner, method, None)
+    return None if found is None else found(*args)
+
+
+def check_sizes(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
+    """Refuse a state of other networks before anything is copied."""
+    for name, tensor in own.items():
+        if given[name].shape != tensor.shape:
+            raise ValueError(
+                f"the state holds {given[name].numel()} {name}, this learner has {tensor.numel()}; make it with the "
+                "sizes, the number of critics or members and the number of runs that the state was saved with"
+            )
+
+
+def load_moments(optimiser: torch.optim.Optimizer, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
+    """Take the moments of an optimiser of one parameter; none are those of one that has seen nothing.
+
+    In place where there are some: a captured CUDA graph goes on writing to these very moments. Copied where there are
+    none: `torch.optim.Optimizer.load_state_dict` would share them with whoever gave them.
+    """
+    state = optimiser.state[parameter]
+    for moment in state.values():
+        moment.zero_()
+    for name, moment in moments.items():
+        if name in state:
+            state[name].copy_(moment)
+        else:
+            # Adam counts its steps on the CPU, unless it can be captured in a graph.
+            on_gpu = optimiser.defaults.get("capturable", False) or moment.ndim > 0
+            state[name] = moment.detach().to(parameter.device if on_gpu else "cpu", copy=True)

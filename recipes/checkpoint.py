@@ -1,0 +1,206 @@
+"""Checkpoints of a run: written aside, synced, checksummed, renamed; the last two are kept.
+
+``checkpoint/`` in a run's folder holds ``replay.bin``, to which the rows of each episode are appended, and for each
+checkpoint a folder of `torchrl.checkpoint` with everything else. TorchRL gives the format, the adapters and the
+rotation; the checksums, the syncing and the replay that is not written again each time are ours.
+
+References:
+    TorchRL: `torchrl.checkpoint <https://docs.pytorch.org/rl>`_.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState, StateDictCheckpointAdapter
+
+from coim import CoAdaptation
+from recipes.replay_file import ReplayFile
+
+FORMAT = 1  # of what is in a checkpoint; another one is refused
+CHECKSUMS = "sha256.json"
+PREFIX = "checkpoint"
+KEPT = 2
+
+
+class Checkpoints:
+    """Saves an algorithm between two of its events, and lets another one go on from there.
+
+    Args:
+        folder: of the run.
+        algorithm: whose episodes have ``episode_steps`` rows, and whose Replay_Pop holds all of them.
+
+    Note:
+        Replay_Ind (the last rows of Replay_Pop) and Replay_s0 (the first of each episode) are not written: they are
+        read out of Replay_Pop again. Replay_Art is written.
+    """
+
+    def __init__(self, folder: Path, algorithm: CoAdaptation) -> None:
+        self.folder, self.algorithm = folder / "checkpoint", algorithm
+        self._replay = ReplayFile(self.folder / "replay.bin")
+        self._step = 0
+
+    def save(self, notes: Mapping[str, Any]) -> None:
+        """Write a checkpoint; until it is complete, the one before it is the newest.
+
+        Args:
+            notes: plain JSON that goes with it.
+
+        Raises:
+            OSError: if it cannot be written: a full disk, a folder that has become read-only.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        state, rows = without_replay(self.algorithm.state_dict())
+        aside = self.folder / ".new"
+        try:
+            self._replay.append({key: value[self._replay.num_rows :] for key, value in rows.items()})
+            about = {"format": FORMAT, "replay": self._replay.description(), **notes}
+            parts(_Held(state), about).save(aside)
+            seal(aside)
+            os.replace(aside, self.folder / f"{PREFIX}-{self._step + 1:012d}")
+            sync(self.folder)
+        except (OSError, RuntimeError) as error:  # torch.save says RuntimeError when a disk is full
+            last = f"the last one, number {self._step}, is good" if self._step else "there is none yet"
+            shutil.rmtree(aside, ignore_errors=True)
+            reason = str(error).splitlines()[0]
+            raise OSError(f"the checkpoint could not be written ({reason}); training stops, {last}") from error
+        self._step += 1
+        CheckpointRotation(self.folder, keep_last=KEPT, prefix=PREFIX).prune()
+
+    def load(self) -> dict[str, Any] | None:
+        """Let the algorithm go on from the newest checkpoint that is whole.
+
+        Returns:
+            The notes that were saved with it; None if none was ever completed.
+
+        Raises:
+            ValueError: if there are checkpoints and none is whole, or it is one of another version or other sizes.
+        """
+        found = sorted(self.folder.glob(f"{PREFIX}-*"), reverse=True)
+        for path in self.folder.glob(".*/"):
+            shutil.rmtree(path, ignore_errors=True)  # what a process that was killed had not finished
+        damaged = []
+        for path in found:
+            if complaint := self._complaint(path):
+                damaged.append((path, complaint))
+                continue
+            for worse, why in damaged:
+                os.replace(worse, worse.with_name(f"damaged-{worse.name}"))
+                print(f"warning: {worse} is damaged ({why}); going on from {path.name}", file=sys.stderr)
+            return self._read(path)
+        if damaged:
+            raise ValueError("no checkpoint is whole: " + "; ".join(f"{path} ({why})" for path, why in damaged))
+        return None
+
+    def _complaint(self, path: Path) -> str | None:
+        """What is wrong with a checkpoint, or None."""
+        try:
+            expected = json.loads((path / CHECKSUMS).read_text())
+            actual = checksums(path)
+            wrong = sorted(name for name in expected.keys() | actual.keys() if expected.get(name) != actual.get(name))
+            if wrong:
+                return f"{', '.join(wrong)} not as written"
+            return self._replay.complaint(_notes(path)["replay"])
+        except (OSError, ValueError, KeyError) as error:
+            return f"{type(error).__name__}: {error}"
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        notes = _notes(path)
+        if notes["format"] != FORMAT:
+            raise ValueError(
+                f"{path} has format {notes['format']}, this version writes {FORMAT}; go on with the version in "
+                "the run's config.json"
+            )
+        held = _Held({})
+        parts(held, {}).load(path)
+        rows = self._replay.read(notes["replay"])
+        steps = self.algorithm.env.episode_steps
+        self.algorithm.load_state_dict(with_replay(held.state, rows, steps))
+        self._step = int(path.name.removeprefix(f"{PREFIX}-"))
+        return notes
+
+
+class _Held:
+    """A state between a file and an algorithm, so that nothing is changed before all of it is read."""
+
+    def __init__(self, state: dict[str, Any]) -> None:
+        self.state = state
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.state = state
+
+
+def parts(held: _Held, notes: dict[str, Any]) -> Checkpoint:
+    """What a checkpoint consists of, each with the adapter that writes it."""
+    checkpoint = Checkpoint(notes=notes)
+    # One file each: a file for every tensor, TorchRL's default, costs a sync for every tensor.
+    checkpoint.register("algorithm", held, adapter=StateDictCheckpointAdapter("torch"))
+    checkpoint.register("random", GlobalRNGState(), adapter=StateDictCheckpointAdapter("torch"))
+    return checkpoint
+
+
+def _notes(path: Path) -> dict[str, Any]:
+    notes: dict[str, Any] = {}
+    Checkpoint(notes=notes).load(path)
+    return notes
+
+
+def without_replay(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Take out of a state what `with_replay` puts back in; returns the rest, and the rows of Replay_Pop."""
+    buffers = dict(state["buffers"])
+    rows = buffers["pop"]["rows"]
+    for name in ("pop", "ind", "s0"):
+        count = len(next(iter(buffers[name]["rows"].values()), ()))
+        buffers[name] = {**buffers[name], "rows": count}
+    # Copied, or torch.save would write the whole capacity that they are views of.
+    art = {key: value.clone() for key, value in buffers["art"]["rows"].items()}
+    buffers["art"] = {**buffers["art"], "rows": art}
+    return {**state, "buffers": buffers}, rows
+
+
+def with_replay(state: dict[str, Any], rows: Mapping[str, Tensor], episode_steps: int) -> dict[str, Any]:
+    """Fill the buffers of a state with rows of Replay_Pop: all, those of the last body, the first of each episode."""
+    chosen = {
+        "pop": lambda rows, count: rows[:count],
+        "ind": lambda rows, count: rows[len(rows) - count :],
+        "s0": lambda rows, count: rows[::episode_steps][:count],
+    }
+    buffers = dict(state["buffers"])
+    for name, choose in chosen.items():
+        count = buffers[name]["rows"]
+        filled = {key: choose(value, count) for key, value in rows.items()} if count else {}
+        buffers[name] = {**buffers[name], "rows": filled}
+    return {**state, "buffers": buffers}
+
+
+def seal(folder: Path) -> None:
+    """Write the checksums of all files of a folder beside them, and be sure that all is on the disk."""
+    (folder / CHECKSUMS).write_text(json.dumps(checksums(folder), indent=2))
+    for path in [*folder.rglob("*"), folder]:
+        sync(path)
+
+
+def checksums(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file in a folder but the checksums themselves."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != CHECKSUMS)
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's contents, or a folder's entries, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,76 @@
+"""Ctrl-C, SIGTERM, and two processes on one folder."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+LOCK = ".lock"
+
+
+class Stopped(KeyboardInterrupt):
+    """Somebody told this process to end.
+
+    Attributes:
+        signum: 2 is Ctrl-C, 15 is what schedulers send.
+    """
+
+    def __init__(self, signum: int) -> None:
+        super().__init__()
+        self.signum = signum
+
+    def __str__(self) -> str:
+        return "stopped by " + ("Ctrl-C" if self.signum == signal.SIGINT else signal.Signals(self.signum).name)
+
+
+@contextmanager
+def stopping_at_once() -> Iterator[None]:
+    """Raise `Stopped` at the first Ctrl-C or SIGTERM, wherever the program is; a second one ends the process.
+
+    Nothing is saved on the way out: there is a checkpoint of every episode, and the rest of this one can take long.
+    """
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        for name in before:
+            signal.signal(name, end)
+        raise Stopped(signum)
+
+    def end(signum: int, frame: FrameType | None) -> None:
+        os._exit(128 + signum)
+
+    before = {signum: signal.signal(signum, stop) for signum in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        stopped = signal.getsignal(signal.SIGINT) is end
+        for signum, handler in before.items():
+            # Who was told to end stays within reach of a second Ctrl-C until the process is gone.
+            signal.signal(signum, end if stopped else handler)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep every other process out of a run's folder, which is made if it does not exist.
+
+    The system drops the lock when the process ends, however it ends.
+
+    Raises:
+        BlockingIOError: if another process is at work in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            owner = file.read().strip() or "another process"
+            raise BlockingIOError(f"{folder} is in use by {owner}; wait for it, or stop it") from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {os.uname().nodename}")
+        file.flush()
+        yield

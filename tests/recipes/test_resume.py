@@ -1,0 +1,157 @@
+"""What ends a run before its time, and what is refused when it shall go on."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import time
+from collections.abc import Iterator
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import pytest
+import torch
+from interrupted_runs import cut, resume, run
+
+from recipes import soak
+from recipes.checkpoint import Checkpoints
+from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.replay_file import ReplayFile
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was left alone."""
+    return run(tmp_path_factory.mktemp("left alone") / "whole")
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Put the signal handlers back that a stopped run leaves to the end of its process."""
+    before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for signum, handler in before.items():
+        signal.signal(signum, handler)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--seed", "3", "--lr", "0.1"], r"lr \(0.0003 to 0.1\), seed|seed \(0 to 3\), lr \(0.0003 to 0.1\)"),
+        (["--num-cells", "9"], r"num_cells \(\(8,\) to \(9,\)\)"),
+        (["--out", "elsewhere"], "out"),
+        (["--num-designs", "1"], "num_designs was 4 and can only grow"),
+    ],
+)
+def test_what_would_change_the_past_is_refused_by_name(tmp_path: Path, options: list[str], sentence: str) -> None:
+    folder = cut(tmp_path / "cut", 6)
+    with pytest.raises(SystemExit, match=sentence):
+        resume(folder, *options)
+
+
+def test_what_is_no_run_of_this_environment_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="holds no run"):
+        resume(tmp_path)
+    folder = cut(tmp_path / "cut", 1)
+    config = folder / "config.json"
+    config.write_text(config.read_text().replace('"hopper"', '"walker"'))
+    with pytest.raises(SystemExit, match=r"holds a run of walker: python -m recipes.walker"):
+        resume(folder)
+
+
+def test_settings_of_another_version_are_named(tmp_path: Path) -> None:
+    folder = cut(tmp_path / "cut", 1)
+    config = folder / "config.json"
+    config.write_text(config.read_text().replace('"gamma"', '"discount"'))
+    with pytest.raises(SystemExit, match="other settings: discount, gamma"):
+        resume(folder)
+
+
+def test_other_packages_are_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = cut(tmp_path / "cut", 2)
+    config = json.loads((folder / "config.json").read_text())
+    config["versions"]["mujoco"] = "2.0"
+    (folder / "config.json").write_text(json.dumps(config))
+    resume(folder)
+    assert "mujoco was 2.0 and is" in capsys.readouterr().err
+
+
+def test_a_second_process_is_refused(tmp_path: Path) -> None:
+    folder = cut(tmp_path / "cut", 1)
+    with locked(folder), pytest.raises(SystemExit, match="is in use by process"):
+        resume(folder)
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_run_with_the_line_that_resumes_it(
+    whole: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    handlers: None,
+    signum: signal.Signals,
+) -> None:
+    append = ReplayFile.append
+
+    def append_until_stopped(file: ReplayFile, rows: dict[str, torch.Tensor]) -> None:
+        if file.num_rows == 18:
+            signal.raise_signal(signum)
+        append(file, rows)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ReplayFile, "append", append_until_stopped)
+        with pytest.raises(SystemExit) as stop:
+            run(tmp_path / "stopped", threads=2)
+    assert stop.value.code == 128 + signum
+    assert f"to go on: python -m recipes.hopper --resume {tmp_path / 'stopped'}" in capsys.readouterr().err
+    resume(tmp_path / "stopped")
+    assert soak.differences(whole, tmp_path / "stopped") == []
+
+
+def dawdle(working: Event, stopping: Event) -> None:
+    """What a process does that is told to end and takes its time."""
+    try:
+        with stopping_at_once():
+            working.set()
+            time.sleep(60)
+    except Stopped:
+        stopping.set()
+        time.sleep(60)
+
+
+def test_a_second_signal_ends_the_process_at_once() -> None:
+    working, stopping = soak.PLAIN.Event(), soak.PLAIN.Event()
+    process = soak.PLAIN.Process(target=dawdle, args=(working, stopping))
+    process.start()
+    for reached in (working, stopping):
+        assert reached.wait(60)
+        process.terminate()
+    process.join(30)
+    assert process.exitcode == 128 + signal.SIGTERM
+
+
+def test_a_full_disk_is_one_sentence_and_the_last_checkpoint_is_good(whole: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "full"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    size = (whole / "checkpoint" / "replay.bin").stat().st_size
+    state = soak.last_state(whole, "algorithm").stat().st_size
+    assert state > size
+    with pytest.MonkeyPatch.context() as patched:
+        save = Checkpoints.save
+
+        def save_to_a_small_disk(checkpoints: Checkpoints, notes: dict) -> None:
+            if len(soak.rows_without_seconds(folder / "evaluations.csv")) == 3:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (state // 2, hard))
+            save(checkpoints, notes)
+
+        patched.setattr(Checkpoints, "save", save_to_a_small_disk)
+        try:
+            with pytest.raises(
+                OSError, match=r"could not be written .*; training stops, the last one, number 4, is good"
+            ):
+                run(folder)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    resume(folder)
+    assert soak.differences(whole, folder) == []

@@ -1,0 +1,40 @@
+"""The soak recipe on a toy scale: what it writes, and that it sees what differs."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from recipes import soak
+from recipes.settings import Settings
+
+
+def test_every_kill_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    made: list[Settings] = []
+
+    def killed_and_resumed(folder: Path, settings: Settings, moment: float) -> int:
+        assert 0 < moment < 9.0
+        made.append(settings)
+        return 4
+
+    monkeypatch.setattr(soak, "left_alone", lambda folder, settings: 9.0)
+    monkeypatch.setattr(soak, "killed_and_resumed", killed_and_resumed)
+    monkeypatch.setattr(soak, "differences", lambda one, other: ["replay.bin"] if other.name == "2" else [])
+    soak.main(soak.Soak(kills=4, out=tmp_path / "soak.csv"))
+    with (tmp_path / "soak.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["identical"] for row in rows] == ["True", "True", "False", "True"]
+    assert [row["kind"] for row in rows] == ["known designs", "fleet", "baseline", "known designs"]
+    assert made == [*soak.KINDS.values(), soak.SMALL]
+    assert "3 of 4 identical" in capsys.readouterr().out
+
+
+def test_what_differs_is_named() -> None:
+    one = {"a": torch.zeros(2), "b": (1, None), "c": {"d": 0.5}}
+    other = {"a": torch.tensor([0.0, 1e-30]), "b": (1, 2), "c": {"d": 0.5}}
+    assert list(soak.unequal(one, one, path="state")) == []
+    assert list(soak.unequal(one, other, path="state")) == ["state.a", "state.b.1"]
+    assert list(soak.unequal(one, {"a": one["a"]}, path="state")) == ["state"]
