@@ -155,7 +155,8 @@ def differences(one: Path, other: Path) -> list[str]:
 def rows_without_seconds(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file but for what the clock says."""
     with path.open(newline="") as file:
-        return [{key: value for key, value in row.items() if not key.startswith("seconds")} for row in csv.DictReader(file)]
+        rows = list(csv.DictReader(file))
+    return [{key: value for key, value in row.items() if not key.startswith("seconds")} for row in rows]
 
 
 def last_state(folder: Path, component: str) -> Path:
