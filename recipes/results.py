@@ -109,10 +109,11 @@ class Results:
 
     def _write_metrics(self, event: EpisodeDone) -> None:
         """Append what was measured while learning; ``seconds`` are of all runs together, the same in each row."""
+        parts = sorted(event.seconds)  # learners side by side book theirs in the order in which they end
         if self._metrics is None:
-            columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in event.seconds)]
+            columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in parts)]
             self._metrics = Table(self.folder / "metrics.csv", columns, keep=self._metrics_rows or None)
-        seconds = list(event.seconds.values())
+        seconds = [event.seconds[part] for part in parts]
         self._metrics.append(
             [
                 run,
