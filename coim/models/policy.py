@@ -68,7 +68,7 @@ class PolicyNetwork(nn.Module):
         return loc, log_scale.clamp(*LOG_SCALE_RANGE).exp()
 
     def for_design(self, design: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-        """Prepare `forward` for the steps of an episode, in which the designs stay: a seventh of its time for one row.
+        """Prepare `forward` for the steps of an episode, in which the designs stay.
 
         Everything is looked up, scaled and laid out once; the arithmetic is the same. The weights are read at each
         call, so that it follows a learner that writes to them in place.
