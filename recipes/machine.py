@@ -32,8 +32,8 @@ def prepare(threads: int, device: torch.device) -> bool:
     """Set this process up for training.
 
     Every learner gets one thread: two learners side by side take 0.63 of the time that they take one after the other
-    (docs/results), and threads that wait for each other inside of products collapse when a second process wants the same
-    cores, while threads that do not wait only share them.
+    (docs/results), and threads that wait for each other inside of products collapse when a second process wants the
+    same cores, while threads that do not wait only share them.
 
     Args:
         threads: that may be busy at once.
