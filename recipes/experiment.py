@@ -36,9 +36,9 @@ from coim.designs import DesignGenerator, DesignSearch
 from recipes.checkpoint import Checkpoints
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores, checked_device, prepare
-from recipes.pictures import draw_run
 from recipes.progress import Progress
 from recipes.report import write_report
+from recipes.reporting.pictures import draw_run
 from recipes.results import Results, default_folder, describe, refuse_filled, versions
 from recipes.settings import Settings, episodes_of, parse, read_config
 

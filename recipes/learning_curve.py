@@ -21,7 +21,7 @@ import tyro
 from coim import EpisodeDone, HalfCheetahMorph, run_episode
 from recipes.experiment import build
 from recipes.machine import available_cores, checked_device, prepare
-from recipes.pictures import save
+from recipes.reporting.pictures import save
 from recipes.settings import Settings
 
 # Imagined rows in the individual batches too: on a single body the population's networks never act.

@@ -17,10 +17,10 @@ import matplotlib as mpl
 import tyro
 
 from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
-from recipes import diagnostics, figures
-from recipes.figures import Picture
-from recipes.page import FONT, image, note, page, section, table
-from recipes.records import Record, Row, number, read_records
+from recipes.reporting import diagnostics, figures
+from recipes.reporting.figures import Picture
+from recipes.reporting.page import FONT, image, note, page, section, table
+from recipes.reporting.records import Record, Row, number, read_records
 
 BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph, "walker": WalkerMorph}
 

@@ -16,9 +16,9 @@ from matplotlib.image import imread
 
 from coim import HopperMorph
 from recipes import experiment
-from recipes.figures import describe_correlation, rank_correlation
-from recipes.records import curves, read_record, read_records
 from recipes.report import main, write_report
+from recipes.reporting.figures import describe_correlation, rank_correlation
+from recipes.reporting.records import curves, read_record, read_records
 from tests.recipes.test_experiment import TINY
 
 VOID = {"meta", "img", "br"}
@@ -254,7 +254,7 @@ def test_curves_are_means_over_the_runs_and_neighbours_that_have_a_number() -> N
 
 
 def test_long_runs_are_drawn_as_means_of_neighbouring_episodes(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recipes.curves.MOST_EPISODES", 3)
+    monkeypatch.setattr("recipes.reporting.curves.MOST_EPISODES", 3)
     assert "A point is the mean of 3 episodes." in check(write_report([runs / "one"], out=runs / "long.html")).words
 
 

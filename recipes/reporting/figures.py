@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from coim import MorphEnv
-from recipes.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
-from recipes.curves import explain, mark_kinds, new_figure, plot_over_designs
-from recipes.palette import GREY, literal, style_of
-from recipes.records import Record, Row, number
+from recipes.reporting.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
+from recipes.reporting.curves import explain, mark_kinds, new_figure, plot_over_designs
+from recipes.reporting.palette import GREY, literal, style_of
+from recipes.reporting.records import Record, Row, number
 
 MOST_BODIES = 64  # of one run; of more the best are drawn
 BODIES_COMPARED = 5

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from recipes.curves import (
+from recipes.reporting.curves import (
     STEPS,
     episodes_in_a_point,
     explain,
@@ -19,9 +19,9 @@ from recipes.curves import (
     plot_over_steps,
     points_in_words,
 )
-from recipes.figures import Picture
-from recipes.palette import BLACK, BLUE, GREY, SKY, style_of
-from recipes.records import Record, curves, number
+from recipes.reporting.figures import Picture
+from recipes.reporting.palette import BLACK, BLUE, GREY, SKY, style_of
+from recipes.reporting.records import Record, curves, number
 
 LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
     "loss_actor": "actor loss (1)",

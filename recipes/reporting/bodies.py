@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from coim import MorphEnv
-from recipes.palette import KINDS, kind_handles, put_legend
-from recipes.records import Row, number
+from recipes.reporting.palette import KINDS, kind_handles, put_legend
+from recipes.reporting.records import Row, number
 
 GAP = 0.3  # m between two bodies
 BODIES_IN_A_LINE = 8

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recipes.palette import GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
-from recipes.records import Curves, Record, Row, curves
+from recipes.reporting.palette import GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
+from recipes.reporting.records import Curves, Record, Row, curves
 
 WIDTH = 7.2  # inches: A4 within its margins
 STEPS = "training steps of one run"

@@ -8,9 +8,9 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from coim import MorphEnv
-from recipes.bodies import draw_bodies
-from recipes.curves import explain, plot_over_designs
-from recipes.records import read_record
+from recipes.reporting.bodies import draw_bodies
+from recipes.reporting.curves import explain, plot_over_designs
+from recipes.reporting.records import read_record
 
 BODIES_SHOWN = 8
 
