@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 
+from coim.compiling import compiled
 from coim.continuation import check_sizes, load_moments
 from coim.learner import Precision, share_storage, views
 from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
@@ -38,6 +39,7 @@ class DynamicsLearner:
         num_runs: K when the ensemble is stacked along the run axis.
         precision: ``"bfloat16"`` takes the network's products in bfloat16; weights, moments, targets and losses stay as
             they are.
+        compile: compile the gradients by `torch.compile` in the first update; results differ by rounding.
 
     Attributes:
         loss: the `EnsembleNLLLoss` over the same parameters, for those who want its value or its gradients.
@@ -68,12 +70,14 @@ class DynamicsLearner:
         weight_decay: float = 1e-5,
         num_runs: int | None = None,
         precision: Precision = "float32",
+        compile: bool = False,
     ) -> None:
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
         self.ensemble, self.num_runs = ensemble, num_runs
         self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
         self._lay_out(list(ensemble.network.parameters()), precision)
+        self._find = compiled(dynamics_gradients, self._weights.device) if compile else dynamics_gradients
         on_gpu = self._weights.device.type == "cuda"
         self.optimiser = torch.optim.Adam(
             [self._weights], lr=lr, weight_decay=weight_decay, fused=True, capturable=on_gpu
@@ -188,8 +192,7 @@ class DynamicsLearner:
             batches = [pair for pair in zip(x, target) for _ in range(members)]
         losses = []
         for network, own, batch in zip(self._networks, self._gradients, batches):
-            gradients, loss = dynamics_gradients(network, *batch, log_var_range=LOG_VAR_RANGE)
-            for part, gradient in zip(own, gradients):
-                part.copy_(gradient)
+            gradients, loss = self._find(network, *batch, log_var_range=LOG_VAR_RANGE)
+            torch._foreach_copy_(own, gradients)
             losses.append(loss)
         return torch.stack(losses).reshape(-1, members).sum(-1)

@@ -21,6 +21,7 @@ from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
+from coim.compiling import compiled
 from coim.continuation import check_sizes, load_moments
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
@@ -47,6 +48,7 @@ class SACLearner:
         num_runs: K when the networks are stacked along the run axis.
         precision: ``"bfloat16"`` takes the networks' products in bfloat16; weights, moments, targets and losses stay as
             they are.
+        compile: compile the gradients by `torch.compile` in the first update; results differ by rounding.
         seed: seeds the learner's own generator, from which every policy noise is drawn.
 
     Attributes:
@@ -84,6 +86,7 @@ class SACLearner:
         mix: Literal["batch", "sum"] = "batch",
         num_runs: int | None = None,
         precision: Precision = "float32",
+        compile: bool = False,
         seed: int = 0,
     ) -> None:
         if precision not in ("float32", "bfloat16"):
@@ -99,6 +102,7 @@ class SACLearner:
         self._lay_out(policy.network.mlp, qvalue.module.mlp, precision)
         on_gpu = self._weights.device.type == "cuda"
         self.optimiser = torch.optim.Adam([self._weights], lr=lr, fused=True, capturable=on_gpu)
+        self._find = compiled(sac_gradients, self._weights.device) if compile else sac_gradients
         self._step = CudaGraphModule(self._update_once) if on_gpu else self._update_once
         self.rng = torch.Generator(self._weights.device).manual_seed(seed)
 
@@ -152,7 +156,7 @@ class SACLearner:
             self._read_targets.copy_(self._targets)
         one_by_one = len(self._networks) > 1 or self.num_runs is None
         found = [
-            sac_gradients(
+            self._find(
                 *networks,
                 Batch(*(x[run] for x in rows)) if one_by_one else Batch(*rows),
                 alpha=self.loss.alpha,
@@ -179,7 +183,7 @@ class SACLearner:
         keys = [tuple(name.split(".")) for name, _ in self.qvalue.named_parameters()]
         targets = [self.loss.target_qvalue_params.get(key) for key in keys]
         self._weights = nn.Parameter(share_storage(own))
-        self._weights.grad = self._gradient = torch.zeros_like(self._weights.detach())
+        self._weights.grad = torch.zeros_like(self._weights.detach())
         self._targets = share_storage(targets)
         # Products read these: the weights themselves, or copies in bfloat16 that every update renews.
         self._read_weights, self._read_targets = self._weights.detach(), self._targets
@@ -188,6 +192,8 @@ class SACLearner:
             self._read_targets = self._read_targets.to(torch.bfloat16)
         read, target_views = views(self._read_weights, own), views(self._read_targets, targets)
         policy_views, critic_views = read[: -len(targets)], read[-len(targets) :]
+        gradients = views(self._weights.grad, own)
+        policy_gradients, critic_gradients = gradients[: -len(targets)], gradients[-len(targets) :]
         stack_runs = self._weights.device.type != "cpu" if stack_runs is None else stack_runs
         runs: list[Any] = [()]  # where a network of one run, or of all of them, lies in stacked weights
         if self.num_runs is not None:
@@ -199,6 +205,10 @@ class SACLearner:
                 [_network(critic_views, (*run, n)) for n in copies],
                 [_network(target_views, (*run, n)) for n in copies],
             )
+            for run in runs
+        ]
+        self._gradients = [
+            ([g[run] for g in policy_gradients], [[g[(*run, n)] for g in critic_gradients] for n in copies])
             for run in runs
         ]
 
@@ -240,15 +250,11 @@ class SACLearner:
         return torch.randn(action.shape, generator=self.rng, dtype=action.dtype, device=action.device)
 
     def _collect(self, found: list[SACGradients]) -> None:
-        """Write gradients where Adam reads them, in the order of the flat buffer: layer, then run, then critic."""
-        parts = [g.policy[i] for i in range(len(found[0].policy)) for g in found]
-        stacked = self.num_runs is not None and len(found) == 1
-        for i in range(len(found[0].critics[0])):
-            if stacked:
-                parts.append(torch.stack([critic[i] for critic in found[0].critics], 1))
-            else:
-                parts.extend(critic[i] for g in found for critic in g.critics)
-        self._gradient.copy_(torch.cat([part.reshape(-1) for part in parts]))
+        """Write gradients where Adam reads them."""
+        for (policy, critics), gradients in zip(self._gradients, found):
+            torch._foreach_copy_(policy, gradients.policy)
+            for own, gradient in zip(critics, gradients.critics):
+                torch._foreach_copy_(own, gradient)
 
 
 def same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:

@@ -35,7 +35,7 @@ from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
 from recipes.checkpoint import Checkpoints
 from recipes.interrupt import Stopped, locked, stopping_at_once
-from recipes.machine import available_cores, checked_device, prepare
+from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
@@ -73,10 +73,13 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
         refuse_filled(folder)
     else:
         check_origin(folder, name)
+    if settings.compile:
+        check_compiler()
     algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
-        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners} -> {folder}")
+        how = "compiled in the first episode" if settings.compile else "not compiled"
+        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how} -> {folder}")
     again = f"to go on: python -m recipes.{name} --resume {folder}"
     with locked(folder):
         try:
@@ -174,6 +177,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
             mix=settings.mix,
             num_runs=stacked,
             precision=settings.precision,
+            compile=settings.compile,
             seed=next(seeds),
         )
 
@@ -194,6 +198,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
             weight_decay=settings.weight_decay,
             num_runs=stacked,
             precision=settings.precision,
+            compile=settings.compile,
         )
         dream = WorldModelEnv(ensemble, env, batch_size=env.batch_size)
     return CoAdaptation(

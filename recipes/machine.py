@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import shutil
 
 import torch
 
@@ -26,6 +27,13 @@ def checked_device(name: str) -> torch.device:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device {name!r} cannot be used here ({reason}); try --device cpu") from None
     return device
+
+
+def check_compiler() -> None:
+    """Refuse to compile where there is no C++ compiler, before anything is written."""
+    asked = os.environ.get("CXX")
+    if not any(shutil.which(name) for name in ([asked] if asked else ["g++", "clang++", "c++"])):
+        raise ValueError(f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or --no-compile")
 
 
 def prepare(threads: int, device: torch.device) -> bool:

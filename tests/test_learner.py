@@ -34,9 +34,9 @@ def weights(learner: SACLearner) -> dict[str, torch.Tensor]:
     return {key: value.clone() for key, value in learner.loss.state_dict().items()}
 
 
-@pytest.mark.parametrize("mix", ["batch", "sum"])
-def test_updates_equal_the_loss_adam_and_soft_update(make_rows: Rows, mix: str) -> None:
-    learner = sac_learner(mix=mix)
+@pytest.mark.parametrize(("mix", "compile"), [("batch", False), ("sum", False), ("batch", True)])
+def test_updates_equal_the_loss_adam_and_soft_update(make_rows: Rows, mix: str, compile: bool) -> None:
+    learner = sac_learner(mix=mix, compile=compile)
     policy, qvalue = deepcopy(learner.policy), deepcopy(learner.qvalue)
     loss = CoImSACLoss(policy, qvalue, mix=mix)
     targets, optimiser = SoftUpdate(loss, tau=0.005), torch.optim.Adam(loss.parameters(), lr=3e-4)
@@ -74,6 +74,24 @@ def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(make_rows: Rows) -
         for network, own in ((fleet.policy, learner.policy), (fleet.qvalue, learner.qvalue)):
             for actual, expected in zip(select_run(network, k).parameters(), own.parameters(), strict=True):
                 torch.testing.assert_close(actual, expected, rtol=0, atol=1e-9)
+
+
+def test_compiled_float32_updates_of_a_fleet_equal_the_plain_ones(make_rows: Rows) -> None:
+    def learner(compile: bool) -> SACLearner:
+        torch.manual_seed(0)
+        policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=3)
+        return SACLearner(
+            policy, make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=3), num_runs=3, compile=compile
+        )  # fmt: skip
+
+    batches = make_rows(20, 16, 3, dtype=torch.float32)
+    plain, quick = learner(False), learner(True)
+    metrics, expected = quick.update(batches), plain.update(batches)
+    for key, value in expected.items():
+        torch.testing.assert_close(metrics[key], value, rtol=1e-5, atol=1e-6)
+    for key, value in weights(plain).items():
+        limit = 1e-5 * float(value.abs().max())
+        torch.testing.assert_close(weights(quick)[key], value, rtol=0, atol=limit)
 
 
 def test_the_input_is_left_untouched(make_rows: Rows) -> None:
