@@ -80,6 +80,7 @@ class Iterations:
             batch_size=effort.batch_size,
             num_cells=effort.num_cells,
             model_cells=effort.model_cells,
+            compile=True,
         )
         threads = 2 if side_by_side else 1
         self._events = iter(build(HalfCheetahMorph, settings, threads=threads, side_by_side=side_by_side))

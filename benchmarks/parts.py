@@ -72,7 +72,9 @@ def replay(num_runs: int) -> TransitionBuffer:
     return buffer
 
 
-def sac_learner(effort: Effort, *, num_runs: int = 1, precision: Precision = "float32") -> SACLearner:
+def sac_learner(
+    effort: Effort, *, num_runs: int = 1, precision: Precision = "float32", compile: bool = True
+) -> SACLearner:
     """Fresh policy and critics."""
     env, stacked = HalfCheetahMorph(seed=0), num_runs if num_runs > 1 else None
     return SACLearner(
@@ -80,12 +82,13 @@ def sac_learner(effort: Effort, *, num_runs: int = 1, precision: Precision = "fl
         make_qvalue(env, num_cells=effort.num_cells, num_runs=stacked),
         num_runs=stacked,
         precision=precision,
+        compile=compile,
     )
 
 
-def dynamics_learner(effort: Effort, *, precision: Precision = "float32") -> DynamicsLearner:
+def dynamics_learner(effort: Effort, *, precision: Precision = "float32", compile: bool = True) -> DynamicsLearner:
     """A fresh ensemble that has seen the scale of random rows."""
     ensemble = GaussianEnsemble.for_env(HalfCheetahMorph(seed=0), num_cells=effort.model_cells)
-    learner = DynamicsLearner(ensemble, precision=precision)
+    learner = DynamicsLearner(ensemble, precision=precision, compile=compile)
     learner.observe(random_rows(REPLAY_ROWS))
     return learner

@@ -55,7 +55,7 @@ def measure(rival: str, count: int, effort: Effort) -> list[Figure]:
     times = interleaved(
         {
             "floor": alone(update_products(effort), times=effort.updates),
-            "ours": our_updates(replay(1), effort, 1, "float32", effort.updates),
+            "ours": our_updates(replay(1), effort, effort.updates),
             "theirs": _their_updates(rival, effort),
         },
         effort.repeats,

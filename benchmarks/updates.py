@@ -87,12 +87,15 @@ def _update(effort: Effort, count: int, runs: int) -> list[Figure]:
     updates = max(1, effort.updates // runs)
     buffer, listed = replay(runs), update_products(effort)
     candidates = {
-        "float32": our_updates(buffer, effort, runs, "float32", updates),
-        "bfloat16": our_updates(buffer, effort, runs, "bfloat16", updates),
+        "float32": our_updates(buffer, effort, updates, num_runs=runs),
+        "float32, not compiled": our_updates(buffer, effort, updates, num_runs=runs, compile=False),
+        "bfloat16": our_updates(buffer, effort, updates, num_runs=runs, precision="bfloat16"),
     }
     floor, by_onednn = alone(listed, times=updates * runs), alone(listed, times=updates * runs, library="onednn")
     times = interleaved({"floor": floor, "onednn": by_onednn, **candidates}, effort.repeats)
-    target = {"float32": Target(1.25 if count == 1 else 1.4), "bfloat16": Target(0.85) if count == 1 else None}
+    targets = {"float32": Target(1.25 if count == 1 else 1.4)}
+    if count == 1:
+        targets["bfloat16"] = Target(0.85)
     return [
         Figure(
             row=f"update, {plural(count)}, K = {runs}, {name}",
@@ -100,7 +103,7 @@ def _update(effort: Effort, count: int, runs: int) -> list[Figure]:
             ratios=over(times[name], times["floor"]),
             amounts=tuple(1e3 * seconds / (updates * runs) for seconds in times[name]),
             unit="ms per run",
-            target=target[name],
+            target=targets.get(name),
             note=PRODUCTS_BY.format(median(over(times[name], times["onednn"]))) if name == "float32" else "",
         )
         for name in candidates
@@ -108,14 +111,20 @@ def _update(effort: Effort, count: int, runs: int) -> list[Figure]:
 
 
 def our_updates(
-    buffer: TransitionBuffer, effort: Effort, runs: int, precision: Precision, updates: int
+    buffer: TransitionBuffer,
+    effort: Effort,
+    updates: int,
+    *,
+    num_runs: int = 1,
+    precision: Precision = "float32",
+    compile: bool = True,
 ) -> Callable[[], None]:
     """So many updates as Algorithm 1 does them: all batches in one draw, then `SACLearner.update`."""
-    learner = sac_learner(effort, num_runs=runs, precision=precision)
+    learner = sac_learner(effort, num_runs=num_runs, precision=precision, compile=compile)
 
     def run() -> None:
         batches = sample_batches(buffer, batch_size=effort.batch_size, num_batches=updates)
-        learner.update(batches[:, :, 0] if runs == 1 else batches)
+        learner.update(batches[:, :, 0] if num_runs == 1 else batches)
 
     return run
 
@@ -133,7 +142,7 @@ def torchrl(effort: Effort) -> list[Figure]:
             times = interleaved(
                 {
                     "floor": alone(update_products(effort), times=updates),
-                    "ours": our_updates(buffer, effort, 1, "float32", updates),
+                    "ours": our_updates(buffer, effort, updates),
                     "theirs": _torchrl_updates(buffer, effort, updates),
                 },
                 effort.repeats,
