@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,6 +46,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Conduct a study; ends with 1 if a cell failed again and again."""
+    check(options)
     study = find(options.study)
     folder = options.out or Path("runs") / f"study-{study.name}"
     workers = options.workers or max(1, available_cores() // options.cpus)
@@ -57,13 +59,26 @@ def main(options: Options) -> None:
             # Ray takes SIGTERM for itself when it starts.
             with ray_running(address=options.ray_address, workers=workers, cpus=options.cpus), stopping_at_once():
                 failed = Conductor(folder, cells, ledger, Resources(options.cpus, options.gpus)).conduct()
-    except Stopped as stop:
-        print(f"\n{stop}; to go on: {command(options)}", file=sys.stderr)
-        sys.exit(128 + stop.signum)
+    except KeyboardInterrupt as stop:  # Stopped, unless Ray was the first to see it
+        signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
+        print(f"\n{Stopped(signum)}; to go on: {command(options)}", file=sys.stderr)
+        sys.exit(128 + signum)
     if failed:
         told = [f"  {name}: {ledger.entries[name].message[:300]}" for name in failed]
         again = f"to try them again: {command(options)}"
         sys.exit("\n".join([f"failed, after {1 + RETRIES} tries each:", *told, again]))
+
+
+def check(options: Options) -> None:
+    """Refuse by name what cannot be asked for."""
+    if options.cpus < 1:
+        raise ValueError(f"--cpus is {options.cpus}, a cell needs at least 1")
+    if options.gpus < 0:
+        raise ValueError(f"--gpus is {options.gpus}, a share is at least 0")
+    if options.workers < 0:
+        raise ValueError(f"--workers is {options.workers}, it must be at least 0 (0: as many as have cores)")
+    if options.workers and options.ray_address is not None:
+        raise ValueError("--workers is of this machine; a cluster decides itself, by --cpus and --gpus of each cell")
 
 
 def find(study: str) -> Study:

@@ -11,10 +11,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
@@ -37,7 +38,7 @@ def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) 
     """Connect to a cluster, or be one for as long as this lasts.
 
     Args:
-        address: of a cluster; None starts Ray on this machine, reachable from nowhere else.
+        address: of a cluster; None starts Ray on this machine.
         workers: cells at once on this machine.
         cpus: cores of each.
     """
@@ -56,7 +57,6 @@ def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) 
             num_cpus=workers * cpus,
             include_dashboard=False,
             object_store_memory=OBJECT_STORE,
-            _node_ip_address="127.0.0.1",
             _temp_dir=temporary,
             **common,
         )
@@ -93,7 +93,7 @@ class Conductor:
         self.ledger, self.folder = ledger, folder.resolve()
         unfinished = set(ledger.in_state("waiting"))
         self.cells = [cell for cell in cells if cell.name in unfinished]
-        self.resources = resources
+        self.resources, self._terminal = resources, sys.stdout
         self._made_before = sum(self._episodes_done(cell) for cell in self.cells)
         self._started = time.monotonic()
 
@@ -102,19 +102,33 @@ class Conductor:
 
         Returns:
             Names of those that failed again and again.
+
+        Raises:
+            KeyboardInterrupt: when told to end. What was computed stays, and all processes that compute end at once:
+                checkpoints are made for that.
         """
+        words = self.folder / "logs" / "ray.log"
+        words.parent.mkdir(parents=True, exist_ok=True)
+        # Ray reports each death of a process at length, in this process's own output.
+        with words.open("a", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
+            self._wait_for(self._submit())
+        return self.ledger.in_state("failed")
+
+    def _submit(self) -> dict[ray.ObjectRef, Cell]:
+        """Hand all cells to Ray, which begins with the first as soon as there are resources."""
         remote = ray.remote(
             num_cpus=self.resources.cpus,
             num_gpus=self.resources.gpus,
             max_retries=RETRIES,
             retry_exceptions=True,
         )(compute)
-        running = {
-            remote.remote(cell.environment, self.settings_of(cell), self.log_of(cell)): cell for cell in self.cells
-        }
+        return {remote.remote(cell.environment, self.settings_of(cell), self.log_of(cell)): cell for cell in self.cells}
+
+    def _wait_for(self, running: dict[ray.ObjectRef, Cell]) -> None:
         try:
             while running:
-                done, _ = ray.wait(list(running), timeout=POLL)
+                time.sleep(POLL)  # not in ray.wait, which would turn every signal into Ctrl-C
+                done, _ = ray.wait(list(running), num_returns=len(running), timeout=0)
                 self._note_tries()
                 for reference in done:
                     self._note_end(running.pop(reference), reference)
@@ -122,7 +136,6 @@ class Conductor:
             for reference in running:  # a cluster outlives this process
                 ray.cancel(reference, force=True)
             self.ledger.stop()
-        return self.ledger.in_state("failed")
 
     def settings_of(self, cell: Cell) -> Settings:
         """Of a cell's run, its folder and this machine included."""
@@ -171,7 +184,7 @@ class Conductor:
         return episodes_done(self.folder_of(cell), cell.settings.num_runs)
 
     def _say(self, cell: Cell, words: str) -> None:
-        print(f"{time.strftime('%H:%M:%S')}  {cell.name}  {words}", flush=True)
+        print(f"{time.strftime('%H:%M:%S')}  {cell.name}  {words}", file=self._terminal, flush=True)
 
 
 def all_episodes(cell: Cell) -> int:
