@@ -20,7 +20,7 @@ import tyro
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores
 from recipes.results import write_whole
-from recipes.studies.conduct import RETRIES, Conductor, Resources, ray_running
+from recipes.studies.conduct import RETRIES, Conductor, Resources, lacking, ray_running
 from recipes.studies.definition import Study, from_json, to_json
 from recipes.studies.ledger import Ledger
 from recipes.studies.named import STUDIES
@@ -58,7 +58,12 @@ def main(options: Options) -> None:
             print(f"{study.name}: {len(ledger.in_state('waiting'))} of {len(cells)} cells to compute -> {folder}")
             # Ray takes SIGTERM for itself when it starts.
             with ray_running(address=options.ray_address, workers=workers, cpus=options.cpus), stopping_at_once():
-                failed = Conductor(folder, cells, ledger, Resources(options.cpus, options.gpus)).conduct()
+                resources = Resources(options.cpus, options.gpus)
+                if lack := lacking(resources):
+                    if options.ray_address is None:
+                        raise ValueError(f"{lack} here; ask for less by --cpus and --gpus")
+                    print(f"{lack}; waiting for one", flush=True)
+                failed = Conductor(folder, cells, ledger, resources).conduct()
     except KeyboardInterrupt as stop:  # Stopped, unless Ray was the first to see it
         signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
         print(f"\n{Stopped(signum)}; to go on: {command(options)}", file=sys.stderr)

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 
@@ -42,7 +43,7 @@ def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) 
         workers: cells at once on this machine.
         cpus: cores of each.
     """
-    common = {"log_to_driver": False, "logging_level": "ERROR"}
+    common: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is not None:
         ray.init(address=address, **common)
         try:
@@ -185,6 +186,14 @@ class Conductor:
 
     def _say(self, cell: Cell, words: str) -> None:
         print(f"{time.strftime('%H:%M:%S')}  {cell.name}  {words}", file=self._terminal, flush=True)
+
+
+def lacking(resources: Resources) -> str:
+    """What no node of the cluster that we are connected to has, or nothing."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if any(node.get("CPU", 0) >= resources.cpus and node.get("GPU", 0) >= resources.gpus for node in nodes):
+        return ""
+    return f"no node has {resources.cpus} cores" + (f" and {resources.gpus:g} of a GPU" if resources.gpus else "")
 
 
 def all_episodes(cell: Cell) -> int:

@@ -158,6 +158,14 @@ def test_what_a_process_had_not_finished_when_it_was_killed_is_in_nobodys_way(tm
     assert episodes_done(tmp_path, 1) == 1
 
 
+def test_the_study_of_the_readme_is_one(tmp_path: Path) -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (tmp_path / "mine.json").write_text(readme.split("```json\n")[1].split("```")[0])
+    cells = from_json(tmp_path / "mine.json").cells()
+    assert [cell.arm for cell in cells] == ["none", "oracle"] * 3
+    assert {cell.settings.episodes for cell in cells} == {20}
+
+
 @pytest.mark.parametrize(("seconds", "words"), [(12.3, "12 s"), (600, "10 min"), (9000, "2.5 h")])
 def test_times_are_said_as_one_would_say_them(seconds: float, words: str) -> None:
     assert in_words(seconds) == words

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from recipes.soak import differences
-from recipes.studies.conduct import Conductor, Resources, ray_running
+from recipes.studies.conduct import Conductor, Resources, lacking, ray_running
 from recipes.studies.definition import Study, to_json
 from recipes.studies.ledger import Ledger, read_ledger
 from recipes.study import entry
@@ -202,6 +202,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
         return ["hopper-forward-known-0"]
 
     monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr("recipes.study.lacking", lambda _: "")
     monkeypatch.setattr(Conductor, "conduct", fail)
     with pytest.raises(SystemExit) as ended:
         entry(["smoke", "--out", str(tmp_path / "s")])
@@ -210,6 +211,15 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
         f"to try them again: python -m recipes.study smoke --out {tmp_path / 's'}"
     )
     assert capsys.readouterr().out == f"smoke: 2 of 2 cells to compute -> {tmp_path / 's'}\n"
+
+
+@pytest.mark.usefixtures("cluster")
+def test_what_no_node_has_is_said_instead_of_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
+        entry(["smoke", "--out", str(tmp_path / "s"), "--gpus", "0.5"])
+    assert lacking(Resources(cpus=2)) == ""
+    assert lacking(Resources(cpus=3)) == "no node has 3 cores"
 
 
 @pytest.mark.parametrize(
