@@ -4,7 +4,7 @@ Everything that is public, in one flat list. Importing it starts nothing, reads 
 """
 
 # First, before TorchRL imports mujoco itself: a missing OpenGL library is then said in one sentence.
-from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, WorldModelEnv
+from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
 
 # isort: split
 from coim.batches import sample_batches, sample_mixed, sample_mixture
@@ -54,6 +54,7 @@ __all__ = [
     "QValue",
     "RandomDesigns",
     "SACLearner",
+    "SimulatorDynamics",
     "StackedMLP",
     "TransitionBuffer",
     "WalkerMorph",

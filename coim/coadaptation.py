@@ -61,6 +61,9 @@ class CoAdaptation:
         buffers: Replay_Pop, Replay_Ind, Replay_s0 and Replay_Art.
         search: maximises Eq. 5 over the design space.
         first_designs: ``[I, D]`` bodies that every run tries first.
+        bodies: which come after them: ``"search"`` is Algorithm 1 (the optimum of Eq. 5 and a random one in turn),
+            ``"random"`` never searches. ``"fixed"`` takes the first of the first designs every time, from the start on:
+            the same budget for one body.
         dynamics: learns p~ from Replay_Pop after each episode; None learns none.
         dream: where transitions are imagined; given together with ``generator``.
         generator: G, the designs that are imagined.
@@ -105,6 +108,7 @@ class CoAdaptation:
         buffers: Buffers,
         search: DesignSearch,
         first_designs: Tensor,
+        bodies: Literal["search", "random", "fixed"] = "search",
         dynamics: DynamicsLearner | None = None,
         dream: WorldModelEnv | None = None,
         generator: DesignGenerator | None = None,
@@ -149,7 +153,7 @@ class CoAdaptation:
             raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")
         self.env, self.evaluation_env = env, evaluation_env
         self.population, self.individual, self.dynamics = population, individual, dynamics
-        self.buffers, self.search, self.first_designs = buffers, search, first_designs
+        self.buffers, self.search, self.first_designs, self.bodies = buffers, search, first_designs, bodies
         self.dream, self.generator = dream, generator
         self.num_designs, self.first_episodes, self.episodes = num_designs, first_episodes, episodes
         self.individual_updates, self.population_updates, self.model_updates = updates.values()
@@ -305,13 +309,16 @@ class CoAdaptation:
     # -- the second loop of Algorithm 1: design -----------------------------------------------------------------------
 
     def _next_design(self) -> tuple[Kind, Tensor, Tensor | None]:
-        """First designs in order, then the optimum of Eq. 5 and a random design in turn."""
+        """First designs in order, then the optimum of Eq. 5 and a random design in turn; see ``bodies``."""
         runs = self.env.batch_size.numel()
         since = self.index - len(self.first_designs)
+        if self.bodies == "fixed":
+            design = self.first_designs[0].expand(runs, -1)
+            return "fixed", design, self._predict(design)
         if since < 0:
             design = self.first_designs[self.index].expand(runs, -1)
             return "first", design, self._predict(design)
-        if since % 2 == 0:
+        if self.bodies == "search" and since % 2 == 0:
             found = [self.search.maximise(fitness) for fitness in self._fitness()]
             return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
         design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self.rngs["designs"])

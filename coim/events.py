@@ -10,7 +10,7 @@ from typing import Literal
 
 from torch import Tensor
 
-Kind = Literal["first", "optimised", "random"]
+Kind = Literal["first", "optimised", "random", "fixed"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class DesignChosen:
 
     Attributes:
         index: 0 for the first.
-        kind: one of the first designs, the optimum of Eq. 5, or a random one.
+        kind: one of the first designs, the optimum of Eq. 5, a random one, or the one body that is fixed throughout.
         design: ``[K, D]``.
         predicted: Eq. 5 at this design before anything is learnt on it, ``[K]``; None while there is no start state.
     """

@@ -27,6 +27,7 @@ from coim import (
     ParticleSwarm,
     RandomDesigns,
     SACLearner,
+    SimulatorDynamics,
     WorldModelEnv,
     make_policy,
     make_qvalue,
@@ -41,6 +42,8 @@ from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
 from recipes.results import Results, default_folder, describe, refuse_filled, versions
 from recipes.settings import Settings, episodes_of, parse, read_config
+
+SIMULATED_ROWS = 250  # bodies that the simulator sets up and steps at once where it takes the ensemble's place
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
@@ -107,7 +110,7 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         total_episodes=sum(episodes_of(settings, index) for index in range(settings.num_designs)),
         updates=settings.individual_updates
         + settings.population_updates
-        + settings.model_updates * (settings.designs != "none"),
+        + settings.model_updates * (algorithm.dynamics is not None),
         imagined_share=algorithm.population_parts.imagined / settings.batch_size,
         done=notes["rows"]["evaluations"] // settings.num_runs if notes else 0,
         best=float("-inf") if trial is None else float(trial.best.mean()),
@@ -184,7 +187,11 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
     population, individual = learner(), learner()
     generator = make_generator(env, settings)
     dynamics, dream = None, None
-    if generator is not None:
+    if generator is not None and settings.dream == "simulator":
+        # Its reset noise is never used: the seeds of all other parts stay what they are with an ensemble.
+        truth = SimulatorDynamics(body(num_runs=SIMULATED_ROWS, seed=0, num_threads=threads, device=device))
+        dream = WorldModelEnv(truth, env, batch_size=env.batch_size)
+    elif generator is not None:
         ensemble = GaussianEnsemble.for_env(
             env,
             num_members=settings.num_members,
@@ -209,6 +216,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         buffers=make_buffers(env, settings, seed=next(seeds)),
         search=make_search(env, settings, seed=next(seeds)),
         first_designs=torch.tensor(body.FIRST_DESIGNS, device=device),
+        bodies=settings.bodies,
         dynamics=dynamics,
         dream=dream,
         generator=generator,

@@ -23,6 +23,10 @@ class Settings:
     """Which way the speed in the reward counts (Fig. 1, first and second row)."""
     designs: Literal["known", "noisy", "random", "none"] = "known"
     """G, the designs that are imagined: as stored, with noise, uniform, or none (the model-free baseline)."""
+    dream: Literal["ensemble", "simulator"] = "ensemble"
+    """Who imagines: the learnt ensemble, or the simulator itself, which tells the ensemble's error from the rest."""
+    bodies: Literal["search", "random", "fixed"] = "search"
+    """Bodies after the first ones: optimised and random in turn, all random, or the body as drawn from start to end."""
     sigma: float = 0.1
     """Standard deviation of the noisy designs, in scale factors (Sec. 6.4)."""
     seed: int = 0
@@ -160,6 +164,8 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
         first.error(f"--seed is {settings.seed}, it must be at least 0")
     if settings.sigma < 0:
         first.error(f"--sigma is {settings.sigma}, a standard deviation is at least 0")
+    if settings.dream == "simulator" and settings.designs == "none":
+        first.error("--dream simulator has nothing to imagine with --designs none; take known, noisy or random")
     if settings.checkpoint_every < 1:
         first.error(f"--checkpoint-every is {settings.checkpoint_every}, it must be at least 1")
     if known.resume is not None:

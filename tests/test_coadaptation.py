@@ -101,6 +101,23 @@ def test_first_designs_are_those_given_and_later_ones_lie_in_the_bounds() -> Non
     assert not torch.equal(chosen[2].design, chosen[4].design)
 
 
+def test_random_bodies_are_never_searched_for() -> None:
+    algorithm = small(bodies="random")
+    algorithm.search.maximise = None  # type: ignore[assignment]
+    chosen = [event for event in algorithm if isinstance(event, DesignChosen)]
+    assert [event.kind for event in chosen] == ["first", "first", "random", "random", "random"]
+    assert len({tuple(event.design[0].tolist()) for event in chosen}) == 5
+
+
+def test_a_fixed_body_takes_the_place_of_every_design_with_the_same_budget() -> None:
+    algorithm = small(bodies="fixed", imagine=False)
+    events = list(algorithm)
+    chosen = [event for event in events if isinstance(event, DesignChosen)]
+    assert [event.kind for event in chosen] == ["fixed"] * 5
+    assert all(torch.equal(event.design, torch.ones(1, 4)) for event in chosen)
+    assert [event.env_steps for event in events if isinstance(event, EpisodeDone)][-1] == 7 * STEPS
+
+
 def test_buffers_after_a_run() -> None:
     algorithm = small()
     last = [event for event in algorithm if isinstance(event, EpisodeDone)][-1]

@@ -13,7 +13,8 @@ except AttributeError as error:  # PyOpenGL's way to say that the library which 
 from coim.envs.half_cheetah import HalfCheetahMorph
 from coim.envs.hopper import HopperMorph
 from coim.envs.morph import MorphEnv
+from coim.envs.simulator_dream import SimulatorDynamics
 from coim.envs.walker import WalkerMorph
 from coim.envs.world_model import WorldModelEnv
 
-__all__ = ["HalfCheetahMorph", "HopperMorph", "MorphEnv", "WalkerMorph", "WorldModelEnv"]
+__all__ = ["HalfCheetahMorph", "HopperMorph", "MorphEnv", "SimulatorDynamics", "WalkerMorph", "WorldModelEnv"]

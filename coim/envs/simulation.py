@@ -48,7 +48,7 @@ class Simulations:
         num_threads: int,
     ) -> None:
         self._drawn, self._shape_body = drawn, shape_body
-        self._models = [self.body(design).compile() for design in designs]
+        self._models = self._compiled(designs)
         self._batch = Batch(self._models[0], len(designs), num_threads)
         self._batch.set_models(self._models)
         self.state: np.ndarray = self._batch.state
@@ -68,7 +68,7 @@ class Simulations:
         return spec
 
     def model(self, row: int) -> mujoco.MjModel:
-        """The compiled body of one simulation."""
+        """The compiled body of one simulation, to be read: simulations of one design may share it."""
         return self._models[row]
 
     def build(self, rows: np.ndarray, designs: np.ndarray) -> None:
@@ -78,9 +78,15 @@ class Simulations:
         is compiled from scratch: patching the fields of a model is faster, but half of them are stale if one is
         forgotten.
         """
-        for row, design in zip(rows, designs):
-            self._models[row] = self.body(design).compile()
+        for row, model in zip(rows, self._compiled(designs)):
+            self._models[row] = model
         self._batch.set_models(self._models)
+
+    def _compiled(self, designs: np.ndarray) -> list[mujoco.MjModel]:
+        """The body of each design, compiled once for all rows that have it."""
+        distinct = {design.tobytes(): design for design in designs}
+        models = {key: self.body(design).compile() for key, design in distinct.items()}
+        return [models[design.tobytes()] for design in designs]
 
     def start(self, rows: np.ndarray) -> None:
         """Put some simulations at the start of their bodies: at rest, with no memory of what was before."""

@@ -58,7 +58,7 @@ def model_errors(records: Sequence[Record]) -> Picture:
     if len(records) == 1:
         mark_builds(axes, records[0])
     if not plot_over_steps(axes, records, "model_error"):
-        return Picture(title, "Nothing was imagined: there is no model.")
+        return Picture(title, "No model was learnt.")
     axes.set(xlabel=f"{STEPS} (1)", ylabel="squared error over\nvariance of changes (1)", yscale="log")
     low, high = axes.get_ylim()
     axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=LogLocator(subs=(3, 4, 6, 7, 8, 9)))

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 BLACK, GREY, LIGHT = "#000000", "#999999", "#E0E0E0"
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 
-KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s")}
+KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s"), "fixed": (ORANGE, "D")}
 DASHES = ("-", "--", ":")
 CHARACTERS = 120  # of a legend, side by side on a page
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)

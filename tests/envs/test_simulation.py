@@ -111,3 +111,14 @@ def test_lifting_moves_a_body_out_of_the_floor_and_leaves_others_alone():
     for row in range(2):
         simulations.lift_out_of_floor(row)
     assert simulations.qpos[:, 1].tolist() == pytest.approx([0.1, 0.3])
+
+
+def test_rows_of_one_design_share_one_body_until_one_of_them_gets_another():
+    designs = np.array([[1.0], [2.0], [1.0]])
+    simulations = Simulations(mujoco.MjSpec.from_string(PENDULUM), shape_body=lengthen, designs=designs, num_threads=1)
+    assert simulations.model(0) is simulations.model(2)
+    simulations.build(np.array([2, 0]), np.array([[1.5], [1.5]]))
+    lengths = [float(simulations.model(k).geom("pole").size[1]) for k in range(3)]
+    assert lengths == [0.75, 1.0, 0.75]
+    simulations.build(np.array([0]), np.array([[1.2]]))
+    assert float(simulations.model(2).geom("pole").size[1]) == 0.75

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from coim import HopperMorph
+from coim.events import Kind
 from recipes.experiment import main
+from recipes.reporting.palette import KINDS
 from recipes.settings import PRESETS, Settings, parse
 
 TINY = ["--num-designs", "7", "--first-episodes", "1", "--episodes", "1", "--episode-steps", "6", "--num-cells", "8"]
@@ -156,3 +159,28 @@ def test_the_papers_numbers_are_the_defaults() -> None:
     assert (paper.gamma, paper.tau, paper.lr, paper.alpha, paper.num_cells) == (0.99, 0.005, 3e-4, 0.01, (200,) * 3)
     assert (paper.num_members, paper.model_cells, paper.model_lr, paper.weight_decay) == (3, (500,) * 3, 3e-4, 1e-5)
     assert (paper.num_start_states, paper.imagined_share, paper.sigma) == (36, 0.2, 0.1)
+
+
+def test_the_simulator_imagines_and_no_model_is_learnt(tmp_path: Path) -> None:
+    run(tmp_path / "oracle", "--designs", "random", "--dream", "simulator", "--num-designs", "2", "--quiet")
+    run(tmp_path / "none", "--designs", "none", "--num-designs", "2", "--quiet")
+    ours, theirs = (read(tmp_path / name / "evaluations.csv") for name in ("oracle", "none"))
+    assert [row["model_error"] for row in ours] == [""] * 2
+    assert "model/loss_dynamics" not in read(tmp_path / "oracle" / "metrics.csv")[0]
+    # Paired: until the population has learnt from what was imagined, the runs are the same.
+    assert ours[0]["return"] == theirs[0]["return"]
+    assert ours[1]["return"] != theirs[1]["return"]
+
+
+def test_a_fixed_body_is_marked_as_such(tmp_path: Path) -> None:
+    run(tmp_path / "fixed", "--designs", "none", "--bodies", "fixed", "--quiet")
+    designs = read(tmp_path / "fixed" / "designs.csv")
+    assert [row["kind"] for row in designs] == ["fixed"] * 7
+    assert all(float(row[f"xi_{i}"]) == 1 for row in designs for i in range(1, 5))
+    assert len({KINDS[kind] for kind in get_args(Kind)}) == len(KINDS)  # pictures tell every kind apart
+
+
+def test_a_simulator_without_designs_to_imagine_is_refused(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        parse("hopper", "", ["--dream", "simulator", "--designs", "none"])
+    assert "nothing to imagine with" in capsys.readouterr().err

@@ -122,7 +122,7 @@ def test_a_fleet_shows_the_mean_and_each_run(runs: Path) -> None:
 def test_a_run_without_imagination_says_so_where_the_model_error_would_be(runs: Path) -> None:
     page = check(runs / "free" / "report.html")
     assert len(page.images) == len(PICTURES) - 1
-    assert "Nothing was imagined: there is no model." in page.words
+    assert "No model was learnt." in page.words
 
 
 def test_folders_become_a_comparison(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -1,0 +1,208 @@
+"""Who computes the cells of a study: Ray, on this machine or on a cluster.
+
+Ray decides where and when, and tries again what failed; here is only what it is asked for and what its user hears.
+
+References:
+    Moritz et al.: Ray, a distributed framework for emerging AI applications, OSDI 2018; https://docs.ray.io.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+
+from recipes.settings import Settings, episodes_of
+from recipes.studies.cell import compute, episodes_done, seconds_of, tries
+from recipes.studies.definition import Cell
+from recipes.studies.ledger import Ledger
+
+RETRIES = 2  # of a cell that fails, and of one whose process dies
+POLL = 0.5  # s between two looks at who has begun
+OBJECT_STORE = 80 * 2**20  # bytes; what a cell makes is on disk, nothing goes through Ray
+
+
+@contextmanager
+def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) -> Iterator[None]:
+    """Connect to a cluster, or be one for as long as this lasts.
+
+    Args:
+        address: of a cluster; None starts Ray on this machine.
+        workers: cells at once on this machine.
+        cpus: cores of each.
+    """
+    common: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is not None:
+        ray.init(address=address, **common)
+        try:
+            yield
+        finally:
+            ray.shutdown()
+        return
+    temporary = tempfile.mkdtemp(prefix="ray-")
+    try:
+        ray.init(
+            address="local",  # whatever RAY_ADDRESS says
+            num_cpus=workers * cpus,
+            include_dashboard=False,
+            object_store_memory=OBJECT_STORE,
+            _temp_dir=temporary,
+            **common,
+        )
+        yield
+    finally:
+        ray.shutdown()
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Resources:
+    """Of each cell.
+
+    Attributes:
+        cpus: cores, and threads that may be busy at once.
+        gpus: share of a GPU; above 0 the networks live there.
+    """
+
+    cpus: int = 1
+    gpus: float = 0.0
+
+
+class Conductor:
+    """Has the cells of a study computed, and keeps its ledger.
+
+    Args:
+        folder: of the study; every node must see it under this name.
+        cells: of the study.
+        ledger: of the study.
+        resources: of each cell.
+    """
+
+    def __init__(self, folder: Path, cells: list[Cell], ledger: Ledger, resources: Resources) -> None:
+        self.ledger, self.folder = ledger, folder.resolve()
+        unfinished = set(ledger.in_state("waiting"))
+        self.cells = [cell for cell in cells if cell.name in unfinished]
+        self.resources, self._terminal = resources, sys.stdout
+        self._made_before = sum(self._episodes_done(cell) for cell in self.cells)
+        self._started = time.monotonic()
+
+    def conduct(self) -> list[str]:
+        """Let all cells be computed that are not finished.
+
+        Returns:
+            Names of those that failed again and again.
+
+        Raises:
+            KeyboardInterrupt: when told to end. What was computed stays, and all processes that compute end at once:
+                checkpoints are made for that.
+        """
+        words = self.folder / "logs" / "ray.log"
+        words.parent.mkdir(parents=True, exist_ok=True)
+        # Ray reports each death of a process at length, in this process's own output.
+        with words.open("a", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
+            self._wait_for(self._submit())
+        return self.ledger.in_state("failed")
+
+    def _submit(self) -> dict[ray.ObjectRef, Cell]:
+        """Hand all cells to Ray, which begins with the first as soon as there are resources."""
+        remote = ray.remote(
+            num_cpus=self.resources.cpus,
+            num_gpus=self.resources.gpus,
+            max_retries=RETRIES,
+            retry_exceptions=True,
+        )(compute)
+        return {remote.remote(cell.environment, self.settings_of(cell), self.log_of(cell)): cell for cell in self.cells}
+
+    def _wait_for(self, running: dict[ray.ObjectRef, Cell]) -> None:
+        try:
+            while running:
+                time.sleep(POLL)  # not in ray.wait, which would turn every signal into Ctrl-C
+                done, _ = ray.wait(list(running), num_returns=len(running), timeout=0)
+                self._note_tries()
+                for reference in done:
+                    self._note_end(running.pop(reference), reference)
+        finally:
+            for reference in running:  # a cluster outlives this process
+                ray.cancel(reference, force=True)
+            self.ledger.stop()
+
+    def settings_of(self, cell: Cell) -> Settings:
+        """Of a cell's run, its folder and this machine included."""
+        device = {"device": "cuda"} if self.resources.gpus else {}
+        return dataclasses.replace(cell.settings, out=self.folder_of(cell), threads=self.resources.cpus, **device)
+
+    def folder_of(self, cell: Cell) -> Path:
+        return self.folder / "cells" / cell.name
+
+    def log_of(self, cell: Cell) -> Path:
+        return self.folder / "logs" / f"{cell.name}.log"
+
+    def _note_tries(self) -> None:
+        """Say who has begun since the last look."""
+        for cell in self.cells:
+            entry = self.ledger.entries[cell.name]
+            if entry.state in ("waiting", "running") and (count := tries(self.log_of(cell))) > entry.tries:
+                again = "goes on" if self.folder_of(cell).exists() and count > 1 else "started"
+                self.ledger.note(cell.name, "running", tries=count)
+                self._say(cell, f"{again} (try {count})" if count > 1 else again)
+
+    def _note_end(self, cell: Cell, reference: ray.ObjectRef) -> None:
+        try:
+            ray.get(reference)
+        except RayError as error:
+            why = f"{type(error.cause).__name__}: {error.cause}" if isinstance(error, RayTaskError) else str(error)
+            message = " ".join(why.split())
+            self.ledger.note(cell.name, "failed", message=message)
+            self._say(cell, f"failed: {message[:200]}; see {self.log_of(cell)}")
+            return
+        seconds = round(seconds_of(self.folder_of(cell)), 1)
+        self.ledger.note(cell.name, "finished", seconds=seconds, message="")
+        finished, total = len(self.ledger.in_state("finished")), len(self.ledger.entries)
+        self._say(cell, f"finished in {in_words(seconds)}; {finished} of {total}{self._time_left()}")
+
+    def _time_left(self) -> str:
+        """Judged by the episodes that were made since this process began."""
+        made = sum(self._episodes_done(cell) for cell in self.cells) - self._made_before
+        failed = set(self.ledger.in_state("failed"))
+        missing = sum(all_episodes(c) - self._episodes_done(c) for c in self.cells if c.name not in failed)
+        if missing <= 0 or made <= 0:
+            return ""
+        return f", about {in_words((time.monotonic() - self._started) * missing / made)} left"
+
+    def _episodes_done(self, cell: Cell) -> int:
+        return episodes_done(self.folder_of(cell), cell.settings.num_runs)
+
+    def _say(self, cell: Cell, words: str) -> None:
+        print(f"{time.strftime('%H:%M:%S')}  {cell.name}  {words}", file=self._terminal, flush=True)
+
+
+def lacking(resources: Resources) -> str:
+    """What no node of the cluster that we are connected to has, or nothing."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if any(node.get("CPU", 0) >= resources.cpus and node.get("GPU", 0) >= resources.gpus for node in nodes):
+        return ""
+    return f"no node has {resources.cpus} cores" + (f" and {resources.gpus:g} of a GPU" if resources.gpus else "")
+
+
+def all_episodes(cell: Cell) -> int:
+    """Training episodes of a whole cell."""
+    return sum(episodes_of(cell.settings, index) for index in range(cell.settings.num_designs))
+
+
+def in_words(seconds: float) -> str:
+    """A time as one would say it."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,103 @@
+"""How far a study has got: one row for each cell, in a file that is always whole."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+from recipes.results import write_whole
+from recipes.studies.definition import Cell
+
+State = Literal["waiting", "running", "finished", "failed"]
+
+
+@dataclasses.dataclass
+class Entry:
+    """One cell.
+
+    Attributes:
+        cell: its name, and that of its folder.
+        state: waiting has not begun, or was stopped and goes on from its checkpoint.
+        tries: how often somebody began to compute it, or went on.
+        seconds: of computing, for a finished cell.
+        message: why it failed.
+    """
+
+    cell: str
+    environment: str
+    task: str
+    arm: str
+    seed: int
+    state: State = "waiting"
+    tries: int = 0
+    seconds: float | None = None
+    message: str = ""
+
+
+COLUMNS = [field.name for field in dataclasses.fields(Entry)]
+
+
+class Ledger:
+    """The rows of ``ledger.csv``; every change is on disk before the next line of the program.
+
+    Args:
+        path: of the file. If it exists, what is finished stays so, and all else waits again.
+        cells: of the study, in the order in which they are computed.
+
+    Raises:
+        ValueError: if the file knows of a cell that the study does not have.
+    """
+
+    def __init__(self, path: Path, cells: Iterable[Cell]) -> None:
+        self.path = path
+        self.entries = {
+            cell.name: Entry(cell.name, cell.environment, cell.settings.task, cell.arm, cell.settings.seed)
+            for cell in cells
+        }
+        for row in read_ledger(path) if path.exists() else []:
+            if row.cell not in self.entries:
+                raise ValueError(f"{path} has the cell {row.cell}, which this study has not; take another folder")
+            state: State = "finished" if row.state == "finished" else "waiting"
+            self.entries[row.cell] = dataclasses.replace(row, state=state)
+        self.write()
+
+    def note(self, cell: str, state: State, **values: int | float | str | None) -> None:
+        """Change a row."""
+        self.entries[cell] = dataclasses.replace(self.entries[cell], state=state, **values)  # type: ignore[arg-type]
+        self.write()
+
+    def stop(self) -> None:
+        """Nobody computes anything any more."""
+        for name, entry in self.entries.items():
+            if entry.state == "running":
+                self.entries[name] = dataclasses.replace(entry, state="waiting")
+        self.write()
+
+    def write(self) -> None:
+        """Put the file in the place of the old one."""
+        text = io.StringIO()
+        rows = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        rows.writeheader()
+        rows.writerows(vars(entry) for entry in self.entries.values())
+        write_whole(self.path, text.getvalue())
+
+    def in_state(self, *states: State) -> list[str]:
+        """Names of the cells in these states."""
+        return [name for name, entry in self.entries.items() if entry.state in states]
+
+
+def read_ledger(path: Path) -> list[Entry]:
+    """The rows of a ``ledger.csv``."""
+    with path.open(newline="") as file:
+        return [
+            Entry(
+                **row
+                | {"seed": int(row["seed"]), "tries": int(row["tries"])}
+                | {"seconds": float(row["seconds"]) if row["seconds"] else None}
+            )
+            for row in csv.DictReader(file)
+        ]

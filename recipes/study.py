@@ -1,0 +1,123 @@
+"""Many runs that are compared: ``python -m recipes.study preview``.
+
+A study is a name of `recipes.studies.named`, or a JSON file with the fields of `recipes.studies.definition.Study`. Its
+folder has ``study.json``, ``ledger.csv`` with a row for each cell, ``cells/`` with an ordinary run folder for each, and
+``logs/``. The same command goes on with what is not finished. `Ray <https://docs.ray.io>`_ computes the cells, on this
+machine or, with ``--ray-address``, on a cluster whose nodes see the folder and this checkout under the same names.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.machine import available_cores
+from recipes.results import write_whole
+from recipes.studies.conduct import RETRIES, Conductor, Resources, lacking, ray_running
+from recipes.studies.definition import Study, from_json, to_json
+from recipes.studies.ledger import Ledger
+from recipes.studies.named import STUDIES
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Make the runs of a study, or go on with them."""
+
+    study: tyro.conf.Positional[str]
+    """Name of a study, or a JSON file with the fields of one."""
+    out: Path | None = None
+    """Folder of the study; by default runs/study-NAME."""
+    workers: int = 0
+    """Cells at once on this machine; 0 takes as many as have cores."""
+    ray_address: str | None = None
+    """A Ray cluster, such as auto or 10.0.0.1:6379; it decides how many cells go at once. By default this machine."""
+    cpus: int = 1
+    """Cores of a cell, and threads that may be busy at once in it."""
+    gpus: float = 0.0
+    """Share of a GPU for each cell; above 0 its networks live there."""
+
+
+def main(options: Options) -> None:
+    """Conduct a study; ends with 1 if a cell failed again and again."""
+    check(options)
+    study = find(options.study)
+    folder = options.out or Path("runs") / f"study-{study.name}"
+    workers = options.workers or max(1, available_cores() // options.cpus)
+    try:
+        with locked(folder), stopping_at_once():
+            cells = study.cells()
+            ledger = Ledger(folder / "ledger.csv", cells)
+            write_whole(folder / "study.json", to_json(study))
+            print(f"{study.name}: {len(ledger.in_state('waiting'))} of {len(cells)} cells to compute -> {folder}")
+            # Ray takes SIGTERM for itself when it starts.
+            with ray_running(address=options.ray_address, workers=workers, cpus=options.cpus), stopping_at_once():
+                resources = Resources(options.cpus, options.gpus)
+                if lack := lacking(resources):
+                    if options.ray_address is None:
+                        raise ValueError(f"{lack} here; ask for less by --cpus and --gpus")
+                    print(f"{lack}; waiting for one", flush=True)
+                failed = Conductor(folder, cells, ledger, resources).conduct()
+    except KeyboardInterrupt as stop:  # Stopped, unless Ray was the first to see it
+        signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
+        print(f"\n{Stopped(signum)}; to go on: {command(options)}", file=sys.stderr)
+        sys.exit(128 + signum)
+    if failed:
+        told = [f"  {name}: {ledger.entries[name].message[:300]}" for name in failed]
+        again = f"to try them again: {command(options)}"
+        sys.exit("\n".join([f"failed, after {1 + RETRIES} tries each:", *told, again]))
+
+
+def check(options: Options) -> None:
+    """Refuse by name what cannot be asked for."""
+    if options.cpus < 1:
+        raise ValueError(f"--cpus is {options.cpus}, a cell needs at least 1")
+    if options.gpus < 0:
+        raise ValueError(f"--gpus is {options.gpus}, a share is at least 0")
+    if options.workers < 0:
+        raise ValueError(f"--workers is {options.workers}, it must be at least 0 (0: as many as have cores)")
+    if options.workers and options.ray_address is not None:
+        raise ValueError("--workers is of this machine; a cluster decides itself, by --cpus and --gpus of each cell")
+
+
+def find(study: str) -> Study:
+    """A study by its name or its file.
+
+    Raises:
+        ValueError: if there is neither.
+    """
+    if study in STUDIES:
+        return STUDIES[study]
+    if study.endswith(".json"):
+        return from_json(Path(study))
+    raise ValueError(f"{study!r} is no study: there are {', '.join(STUDIES)}, or name a file that ends in .json")
+
+
+def command(options: Options) -> str:
+    """The line that goes on with a study."""
+    given = [
+        word
+        for field in dataclasses.fields(Options)[1:]
+        if (value := getattr(options, field.name)) != field.default
+        for word in (f"--{field.name.replace('_', '-')}", str(value))
+    ]
+    return shlex.join(["python", "-m", "recipes.study", options.study, *given])
+
+
+def entry(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    options = tyro.cli(Options, prog="python -m recipes.study", description=__doc__, args=arguments)
+    try:
+        main(options)
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+if __name__ == "__main__":
+    entry()

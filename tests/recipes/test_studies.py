@@ -1,0 +1,171 @@
+"""What a study consists of, and the ledger that remembers how far it has got."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from interrupted_runs import TINY, cut
+
+from recipes.settings import Settings
+from recipes.studies.cell import compute, episodes_done, seconds_of, to_go_on, tries
+from recipes.studies.conduct import all_episodes, in_words
+from recipes.studies.definition import ARMS, PROTOCOLS, Block, Study, from_json, to_json
+from recipes.studies.ledger import Ledger, read_ledger
+from recipes.studies.named import STUDIES
+
+
+def study(**fields: object) -> Study:
+    least = {"name": "s", "environments": ("hopper",), "arms": ("none", "known"), "seeds": (3, 4), "protocol": "smoke"}
+    return Study(**{**least, **fields})
+
+
+def test_every_combination_is_a_cell_and_one_seed_of_all_arms_comes_before_the_next() -> None:
+    more = Block(environments=("walker",), arms=("none",), seeds=(7, 8, 9), tasks=("backward",))
+    assert [cell.name for cell in study(blocks=(more,)).cells()] == [
+        "hopper-forward-none-3",
+        "hopper-forward-known-3",
+        "walker-backward-none-7",
+        "hopper-forward-none-4",
+        "hopper-forward-known-4",
+        "walker-backward-none-8",
+        "walker-backward-none-9",
+    ]
+
+
+def test_arms_of_a_seed_differ_in_nothing_but_the_arm() -> None:
+    cells = study(arms=tuple(ARMS), seeds=(5,), overrides={"lr": 0.1}).cells()
+    assert len(cells) == 7
+    common = {"designs": "none", "bodies": "search", "dream": "ensemble"}
+    assert len({dataclasses.replace(cell.settings, **common) for cell in cells}) == 1
+    assert len({cell.settings for cell in cells}) == 7
+    assert {cell.settings.lr for cell in cells} == {0.1}
+    assert {cell.settings.seed for cell in cells} == {5}
+
+
+def test_seeds_can_share_a_cell_along_the_run_axis() -> None:
+    cells = study(arms=("none",), seeds=(0, 1, 2, 3, 4), seeds_per_cell=2).cells()
+    assert [(cell.settings.seed, cell.settings.num_runs) for cell in cells] == [(0, 2), (2, 2), (4, 1)]
+
+
+def test_a_study_is_read_as_it_was_written(tmp_path: Path) -> None:
+    more = Block(environments=("half_cheetah",), arms=("noisy",), seeds=(0,), overrides={"num_cells": (4, 4)})
+    written = study(blocks=(more,), overrides={"lr": 0.1})
+    (tmp_path / "study.json").write_text(to_json(written))
+    read = from_json(tmp_path / "study.json")
+    assert read.cells() == written.cells()
+    assert read.cells()[2].settings.num_cells == (4, 4)
+    assert to_json(read) == to_json(written)
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"environments": ("ant",)}, "'ant' is none of the environments that there are: half_cheetah, walker, hopper"),
+        ({"arms": ("oracel",)}, "'oracel' is none of the arms"),
+        ({"tasks": ("up",)}, "'up' is none of the tasks"),
+        ({"protocol": "papre"}, "'papre' is none of paper, "),
+        ({"overrides": {"learning_rate": 1}}, "overrides of learning_rate are not possible"),
+        ({"overrides": {"seed": 1}}, "overrides of seed are not possible"),
+        ({"seeds": (1, 1)}, "hopper-forward-known-1, hopper-forward-none-1 would be made twice"),
+        ({"seeds_per_cell": 0}, "seeds_per_cell is 0"),
+    ],
+)
+def test_what_cannot_be_is_named_before_anything_is_computed(fields: dict, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        study(**fields)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [("[", "is no study"), ('{"seed": 1}', "it has seed; there are arms, blocks"), ('{"name": "a"}', "missing")],
+)
+def test_a_file_that_is_no_study_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=sentence):
+        from_json(tmp_path / "a.json")
+    with pytest.raises(ValueError, match=r"b.json cannot be read \(No such file"):
+        from_json(tmp_path / "b.json")
+
+
+def test_the_preview_has_the_papers_networks_batches_and_updates() -> None:
+    preview, paper = PROTOCOLS["preview"], PROTOCOLS["paper"]
+    cheaper = {"num_designs", "first_episodes", "episodes", "search", "precision"}
+    assert dataclasses.replace(paper, **{name: getattr(preview, name) for name in cheaper}) == preview
+    assert preview.num_designs >= 5 + 8
+    assert len(STUDIES["preview"].cells()) == 4 * 5 + 2 * 3
+
+
+def test_the_ledger_keeps_what_is_finished_and_lets_all_else_wait(tmp_path: Path) -> None:
+    cells = study().cells()
+    ledger = Ledger(tmp_path / "ledger.csv", cells)
+    ledger.note(cells[0].name, "finished", tries=1, seconds=2.5)
+    ledger.note(cells[1].name, "running", tries=2)
+    ledger.note(cells[2].name, "failed", tries=3, message='ValueError: "a", b')
+    rows = {row.cell: row for row in read_ledger(tmp_path / "ledger.csv")}
+    assert [rows[cell.name].state for cell in cells] == ["finished", "running", "failed", "waiting"]
+    assert rows[cells[2].name].message == 'ValueError: "a", b'
+    assert rows[cells[3].name].seed == 4
+    again = Ledger(tmp_path / "ledger.csv", cells)
+    assert again.in_state("finished") == [cells[0].name]
+    assert again.in_state("waiting") == [cell.name for cell in cells[1:]]
+    assert (again.entries[cells[0].name].seconds, again.entries[cells[1].name].tries) == (2.5, 2)
+    with pytest.raises(ValueError, match="has the cell hopper-forward-none-4, which this study has not"):
+        Ledger(tmp_path / "ledger.csv", study(seeds=(3,)).cells())
+
+
+def test_a_ledger_grows_with_its_study(tmp_path: Path) -> None:
+    Ledger(tmp_path / "ledger.csv", study(seeds=(3,)).cells()).note("hopper-forward-none-3", "finished")
+    grown = Ledger(tmp_path / "ledger.csv", study().cells())
+    assert grown.in_state("finished") == ["hopper-forward-none-3"]
+    assert len(grown.in_state("waiting")) == 3
+
+
+def test_a_cell_goes_on_where_it_was_cut_and_logs_each_try(tmp_path: Path) -> None:
+    folder, log = tmp_path / "cells" / "a", tmp_path / "logs" / "a.log"
+    settings = dataclasses.replace(TINY, out=folder)
+    assert to_go_on(settings) == settings
+    assert (tries(log), episodes_done(folder, 1)) == (0, 0)
+    cut(folder, 5)
+    assert episodes_done(folder, 1) == 4  # of the fifth save nothing is left but its row
+    assert to_go_on(settings).resume == folder
+    compute("hopper", settings, log)
+    assert tries(log) == 1
+    assert episodes_done(folder, 1) == all_episodes_of(settings)
+    assert seconds_of(folder) > 0
+    assert json.loads((folder / "config.json").read_text())["resumed"][0]["changed"] == {}
+
+
+def all_episodes_of(settings: Settings) -> int:
+    return all_episodes(dataclasses.replace(study().cells()[0], settings=settings))
+
+
+def test_a_cell_that_was_begun_with_other_settings_is_refused_by_name_and_logged(tmp_path: Path) -> None:
+    folder, log = tmp_path / "a", tmp_path / "a.log"
+    cut(folder, 2)
+    with pytest.raises(ValueError, match=r"begun with other settings: lr \(0.0003 to 0.1\)"):
+        compute("hopper", dataclasses.replace(TINY, out=folder, lr=0.1), log)
+    assert "begun with other settings" in log.read_text()
+
+
+def test_what_a_process_had_not_finished_when_it_was_killed_is_in_nobodys_way(tmp_path: Path) -> None:
+    (tmp_path / ".config.json.new").write_text("{")
+    compute(
+        "hopper", dataclasses.replace(TINY, out=tmp_path, num_designs=1, first_episodes=1), tmp_path.with_suffix(".log")
+    )
+    assert episodes_done(tmp_path, 1) == 1
+
+
+def test_the_study_of_the_readme_is_one(tmp_path: Path) -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (tmp_path / "mine.json").write_text(readme.split("```json\n")[1].split("```")[0])
+    cells = from_json(tmp_path / "mine.json").cells()
+    assert [cell.arm for cell in cells] == ["none", "oracle"] * 3
+    assert {cell.settings.episodes for cell in cells} == {20}
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(12.3, "12 s"), (600, "10 min"), (9000, "2.5 h")])
+def test_times_are_said_as_one_would_say_them(seconds: float, words: str) -> None:
+    assert in_words(seconds) == words

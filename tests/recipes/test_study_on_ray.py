@@ -1,0 +1,237 @@
+"""Studies on a real Ray of this machine: a cluster whose head computes nothing, and `python -m recipes.study` alone."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from recipes.soak import differences
+from recipes.studies.conduct import Conductor, Resources, lacking, ray_running
+from recipes.studies.definition import Study, to_json
+from recipes.studies.ledger import Ledger, read_ledger
+from recipes.study import entry
+
+ray_cluster = pytest.importorskip("ray.cluster_utils")
+SLOWER = {"num_designs": 8, "individual_updates": 150}  # an episode takes long enough to be hit
+
+
+def study(**fields: object) -> Study:
+    least = {"name": "test", "environments": ("hopper",), "arms": ("none",), "seeds": (0,), "protocol": "smoke"}
+    return Study(**{**least, **fields})
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator:
+    """A head without cores, as on clusters whose head has other work, and one node with two."""
+    nodes = ray_cluster.Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    nodes.add_node(num_cpus=2)
+    with ray_running(address=nodes.address):
+        yield nodes
+    nodes.shutdown()
+
+
+def conduct(folder: Path, what: Study) -> tuple[list[str], Ledger]:
+    """Compute a study on the cluster that there is."""
+    folder.mkdir(exist_ok=True)
+    cells = what.cells()
+    ledger = Ledger(folder / "ledger.csv", cells)
+    return Conductor(folder, cells, ledger, Resources()).conduct(), ledger
+
+
+def meanwhile(folder: Path, cell: str, *, rows: int, act: Callable[[int], None]) -> threading.Thread:
+    """When a cell has so many episodes, do something with the process that computes it."""
+
+    def watch() -> None:
+        table, log = folder / "cells" / cell / "evaluations.csv", folder / "logs" / f"{cell}.log"
+        while not table.exists() or table.read_text().count("\n") <= rows:
+            time.sleep(0.01)
+        act(int(log.read_text().splitlines()[0].split()[-1]))
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    return thread
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.usefixtures("cluster")
+def test_every_cell_of_a_study_is_an_ordinary_run_and_pairs_share_their_first_designs(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    failed, ledger = conduct(tmp_path, study(arms=("none", "oracle")))
+    assert failed == []
+    assert [(row.state, row.tries, row.message) for row in read_ledger(tmp_path / "ledger.csv")] == [
+        ("finished", 1, "")
+    ] * 2
+    none, oracle = (tmp_path / "cells" / name for name in ledger.entries)
+    designs = [read(folder / "designs.csv") for folder in (none, oracle)]
+    assert [[row["kind"] for row in rows] for rows in designs] == [["first"] * 5 + ["optimised"]] * 2
+    assert all(a[f"xi_{i}"] == b[f"xi_{i}"] for a, b in list(zip(*designs))[:5] for i in range(1, 5))
+    assert read(none / "evaluations.csv")[0]["return"] == read(oracle / "evaluations.csv")[0]["return"]
+    assert (none / "report.html").exists()
+    lines = capsys.readouterr().out.splitlines()
+    assert sorted(line.split()[2] for line in lines) == ["finished", "finished", "started", "started"]
+    assert lines[-1].endswith("2 of 2")
+    assert conduct(tmp_path, study(arms=("none", "oracle")))[0] == []  # nothing is left to do
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_cell_whose_process_is_killed_goes_on_from_its_checkpoint_to_the_same_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    what, cell = study(arms=("known",), overrides=SLOWER), "hopper-forward-known-0"
+    conduct(tmp_path / "peace", what)
+    capsys.readouterr()
+    killing = meanwhile(tmp_path / "killed", cell, rows=3, act=lambda pid: os.kill(pid, signal.SIGKILL))
+    failed, ledger = conduct(tmp_path / "killed", what)
+    killing.join()
+    assert failed == []
+    assert (ledger.entries[cell].state, ledger.entries[cell].tries) == ("finished", 2)
+    assert differences(*(tmp_path / name / "cells" / cell for name in ("peace", "killed"))) == []
+    out, err = capsys.readouterr()
+    assert [line.split(maxsplit=2)[2].split(" in ")[0] for line in out.splitlines()] == [
+        "started",
+        "goes on (try 2)",
+        "finished",
+    ]
+    assert err == ""
+
+
+def test_a_cell_whose_node_dies_goes_on_on_another(cluster: Any, tmp_path: Path) -> None:
+    what, cell = study(overrides=SLOWER), "hopper-forward-none-0"
+    cluster.add_node(num_cpus=2)
+
+    def lose_its_node(pid: int) -> None:
+        parent = Path(f"/proc/{pid}/stat").read_text().split()[3]  # what Ray starts on each node
+        for process in (int(parent), pid):
+            os.kill(process, signal.SIGKILL)
+
+    losing = meanwhile(tmp_path, cell, rows=2, act=lose_its_node)
+    failed, ledger = conduct(tmp_path, what)
+    losing.join()
+    assert failed == []
+    assert ledger.entries[cell].tries == 2
+    assert len(read(tmp_path / "cells" / cell / "evaluations.csv")) == 8
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_cell_that_fails_is_tried_again_twice_and_the_others_are_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "cells" / "hopper-forward-known-0").write_text("in the way")
+    what = study(arms=("known", "none"))
+    failed, ledger = conduct(tmp_path, what)
+    assert failed == ["hopper-forward-known-0"]
+    bad, good = ledger.entries.values()
+    assert (bad.state, bad.tries, good.state, good.tries) == ("failed", 3, "finished", 1)
+    assert "hopper-forward-known-0" in bad.message
+    assert "Error: " in bad.message
+    assert (tmp_path / "logs" / "hopper-forward-known-0.log").read_text().count("Traceback") >= 3
+    assert "failed: " in capsys.readouterr().out
+    (tmp_path / "cells" / "hopper-forward-known-0").unlink()
+    assert conduct(tmp_path, what)[0] == []
+    assert [(row.state, row.message) for row in read_ledger(tmp_path / "ledger.csv")] == [("finished", "")] * 2
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    what, cells = study(arms=("none", "known"), overrides=SLOWER), ["hopper-forward-none-0", "hopper-forward-known-0"]
+    (tmp_path / "my.json").write_text(to_json(what))
+    folder = tmp_path / "my study"
+    arguments = [str(tmp_path / "my.json"), "--out", str(folder), "--workers", "1"]
+    temporary = {"TMPDIR": tempfile.mkdtemp(dir="/tmp")}
+    first = subprocess.Popen(
+        [sys.executable, "-m", "recipes.study", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | temporary,
+    )
+
+    def refuse_another_and_stop(pid: int) -> None:
+        with pytest.raises(SystemExit, match=f"is in use by process {first.pid} "):
+            entry(arguments)
+        stopped.append((pid, time.monotonic()))
+        first.send_signal(signal.SIGTERM)
+
+    stopped: list[tuple[int, float]] = []
+    meanwhile(folder, cells[0], rows=3, act=refuse_another_and_stop)
+    out, err = first.communicate(timeout=100)
+    ((pid, at),) = stopped
+    assert time.monotonic() - at < 10
+    assert first.returncode == 128 + signal.SIGTERM
+    assert not Path(f"/proc/{pid}").exists()
+    assert out.splitlines()[0] == f"test: 2 of 2 cells to compute -> {folder}"
+    assert [line.split(maxsplit=1)[1] for line in out.splitlines()[1:]] == [f"{cells[0]}  started"]
+    assert [(row.state, row.tries) for row in read_ledger(folder / "ledger.csv")] == [("waiting", 1), ("waiting", 0)]
+    told = shlex.split(err.strip())
+    assert told[:6] == ["stopped", "by", "SIGTERM;", "to", "go", "on:"]
+    assert told[6:] == ["python", "-m", "recipes.study", *arguments]
+    assert list(Path(temporary["TMPDIR"]).iterdir()) == []
+    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())  # on the cluster there is
+    entry(told[9:])
+    assert [(row.state, row.tries) for row in read_ledger(folder / "ledger.csv")] == [("finished", 2), ("finished", 1)]
+    assert len(read(folder / "cells" / cells[0] / "evaluations.csv")) == 8
+
+
+def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def fail(conductor: Conductor) -> list[str]:
+        conductor.ledger.note("hopper-forward-known-0", "failed", message="ValueError: no luck")
+        return ["hopper-forward-known-0"]
+
+    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr("recipes.study.lacking", lambda _: "")
+    monkeypatch.setattr(Conductor, "conduct", fail)
+    with pytest.raises(SystemExit) as ended:
+        entry(["smoke", "--out", str(tmp_path / "s")])
+    assert ended.value.code == (
+        "failed, after 3 tries each:\n  hopper-forward-known-0: ValueError: no luck\n"
+        f"to try them again: python -m recipes.study smoke --out {tmp_path / 's'}"
+    )
+    assert capsys.readouterr().out == f"smoke: 2 of 2 cells to compute -> {tmp_path / 's'}\n"
+
+
+@pytest.mark.usefixtures("cluster")
+def test_what_no_node_has_is_said_instead_of_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
+        entry(["smoke", "--out", str(tmp_path / "s"), "--gpus", "0.5"])
+    assert lacking(Resources(cpus=2)) == ""
+    assert lacking(Resources(cpus=3)) == "no node has 3 cores"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["previw"], "'previw' is no study: there are paper, preview, smoke, or name a file that ends in .json"),
+        (["smoke", "--cpus", "0"], "--cpus is 0, a cell needs at least 1"),
+        (["smoke", "--gpus", "-1"], "--gpus is -1"),
+        (["smoke", "--workers", "-1"], "--workers is -1"),
+        (["smoke", "--workers", "2", "--ray-address", "auto"], "a cluster decides itself"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_named(arguments: list[str], sentence: str) -> None:
+    with pytest.raises(SystemExit, match=sentence):
+        entry(arguments)
