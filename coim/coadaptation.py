@@ -234,6 +234,9 @@ class CoAdaptation:
             with booked(seconds, "evaluate"):
                 evaluation = run_episode(self.evaluation_env, self.individual.policy, design=design, deterministic=True)
         self.env_steps += len(rows)
+        metrics["broken"] = sum(
+            found["next", "terminated"].sum(0).squeeze(-1).cpu().float() for found in (rows, evaluation)
+        )
         return EpisodeDone(
             index=self.index,
             kind=kind,
