@@ -26,6 +26,8 @@ from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
 from coim.continuation import Trial, restore, state_of
 from coim.designs import DesignGenerator, DesignSearch, RandomDesigns
+from coim.designs.search import Fitness
+from coim.divergence import Divergence, flat_fitness
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
@@ -153,6 +155,9 @@ class CoAdaptation:
             raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")
         self.env, self.evaluation_env = env, evaluation_env
         self.population, self.individual, self.dynamics = population, individual, dynamics
+        self.divergence = Divergence(
+            env.batch_size.numel(), [learner for learner in (population, individual, dynamics) if learner is not None]
+        )
         self.buffers, self.search, self.first_designs, self.bodies = buffers, search, first_designs, bodies
         self.dream, self.generator = dream, generator
         self.num_designs, self.first_episodes, self.episodes = num_designs, first_episodes, episodes
@@ -179,22 +184,24 @@ class CoAdaptation:
     def __iter__(self) -> Iterator[Event]:
         # All that is known of the loop changes before an event: who stops there, here or in another process with this
         # one's state_dict, and comes back goes on with what would have come next.
-        while self.index < self.num_designs:
+        diverged = self.divergence.places
+        while self.index < self.num_designs and (self.trial is not None or not self.divergence.everywhere):
             if self.trial is None:
-                trial = self.trial = Trial(*self._next_design(), best=torch.full(self.env.batch_size, -torch.inf))
-                yield DesignChosen(self.index, trial.kind, trial.design, trial.predicted)
+                trial = self.trial = self._next_trial()
+                yield DesignChosen(self.index, trial.kind, trial.design, trial.predicted, dict(diverged))
             trial = self.trial
             if trial.next_episode == 0:
                 # Without the population's weights the individual networks would start from the last body's gait.
                 self.individual.start_from(self.population)
                 self.buffers.ind.empty()
                 self._refresh_imagined()
-            while trial.next_episode < self._episodes_of(self.index):
+            while trial.next_episode < self._episodes_of(self.index) and not self.divergence.everywhere:
                 event = self._run_and_learn(trial.kind, trial.design, trial.next_episode)
-                trial.best = torch.maximum(trial.best, event.evaluation_return.cpu())
+                trial.best = torch.fmax(trial.best, event.evaluation_return.cpu())  # NaN of who has diverged counts not
                 trial.next_episode += 1
                 yield event
-            done = DesignDone(self.index, trial.kind, trial.design, trial.best)
+            best = self.divergence.blank(trial.best, (self.index, 0))
+            done = DesignDone(self.index, trial.kind, trial.design, best, dict(diverged))
             self.index, self.trial = self.index + 1, None
             yield done
 
@@ -213,6 +220,7 @@ class CoAdaptation:
 
     def _run_and_learn(self, kind: Kind, design: Tensor, episode: int) -> EpisodeDone:
         seconds: dict[str, float] = {}
+        place, blank = (self.index, episode), self.divergence.blank
         with booked(seconds, "episode"):
             # Collect experience for the current design with pi_Ind.
             with booked(seconds, "collect"):
@@ -224,21 +232,27 @@ class CoAdaptation:
                 metrics = self._observe(rows)
                 self._refresh_imagined()
             self.buffers.s0.extend(rows[:1])
+            self.divergence.remember()
             metrics |= self._learn(seconds)
+            self.divergence.contain(metrics, place)
             with booked(seconds, "evaluate"):
                 evaluation = run_episode(self.evaluation_env, self.individual.policy, design=design, deterministic=True)
         self.env_steps += len(rows)
+        metrics["broken"] = sum(
+            found["next", "terminated"].sum(0).squeeze(-1).cpu().float() for found in (rows, evaluation)
+        )
         return EpisodeDone(
             index=self.index,
             kind=kind,
             episode=episode,
             design=design,
-            training_return=episode_return(rows),
-            evaluation_return=episode_return(evaluation),
+            training_return=blank(episode_return(rows), place),
+            evaluation_return=blank(episode_return(evaluation), place),
             env_steps=self.env_steps,
             imagined=len(self.buffers.art),
-            metrics=metrics,
+            metrics={name: blank(value, place) for name, value in metrics.items()},
             seconds=seconds,
+            diverged=dict(self.divergence.places),
         )
 
     def _observe(self, rows: TensorDictBase) -> Means:
@@ -308,6 +322,16 @@ class CoAdaptation:
 
     # -- the second loop of Algorithm 1: design -----------------------------------------------------------------------
 
+    def _next_trial(self) -> Trial:
+        """The next design; a run that has diverged keeps the body that it has."""
+        kind, design, predicted = self._next_design()
+        frozen = [*self.divergence.places]
+        if frozen:
+            design = design.clone()
+            design[frozen] = self.buffers.ind[0]["design"][frozen]
+            predicted = None if predicted is None else self.divergence.blank(predicted, (self.index, 0))
+        return Trial(kind, design, predicted, best=torch.full(self.env.batch_size, -torch.inf))
+
     def _next_design(self) -> tuple[Kind, Tensor, Tensor | None]:
         """First designs in order, then the optimum of Eq. 5 and a random design in turn; see ``bodies``."""
         runs = self.env.batch_size.numel()
@@ -324,8 +348,8 @@ class CoAdaptation:
         design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self.rngs["designs"])
         return "random", design, self._predict(design)
 
-    def _fitness(self) -> list[DesignValue]:
-        """Eq. 5 of each run, over the same draw of start states."""
+    def _fitness(self) -> list[Fitness]:
+        """Eq. 5 of each run, over the same draw of start states; a run that has diverged has none to climb."""
         states = self.buffers.s0.sample(self.num_start_states)
         policy, qvalue = self.population.policy, self.population.qvalue
         runs = self.env.batch_size.numel()
@@ -333,6 +357,8 @@ class CoAdaptation:
             return [DesignValue(policy, qvalue, states[:, 0], precision=self.precision)]
         return [
             DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k], precision=self.precision)
+            if k not in self.divergence.places
+            else flat_fitness
             for k in range(runs)
         ]
 

@@ -30,7 +30,7 @@ class Trial:
         kind: of the design.
         design: ``[K, D]``.
         predicted: Eq. 5 at this design when it was chosen, ``[K]``, or None.
-        best: highest evaluation return so far, ``[K]``.
+        best: highest evaluation return so far, ``[K]``; -inf of a run that has none, as one that has diverged before.
         next_episode: episodes that are over; with 0 the individual learner has not started yet.
     """
 
@@ -65,6 +65,7 @@ def state_of(algorithm: CoAdaptation) -> dict[str, Any]:
             "index": algorithm.index,
             "env_steps": algorithm.env_steps,
             "trial": None if algorithm.trial is None else dict(vars(algorithm.trial)),
+            "diverged": dict(algorithm.divergence.places),
         },
         "rngs": {name: rng.get_state() for name, rng in algorithm.rngs.items()},
         "env": algorithm.env.get_simulation_state().to_dict(),
@@ -108,6 +109,7 @@ def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
     algorithm.buffers.load_state_dict(state["buffers"])
     position = state["position"]
     algorithm.index, algorithm.env_steps = position["index"], position["env_steps"]
+    algorithm.divergence.places = dict(position["diverged"])
     algorithm.trial = None if position["trial"] is None else _trial(position["trial"], algorithm)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from coim.compiling import compiled
 from coim.continuation import check_sizes, load_moments
-from coim.learner import Precision, share_storage, views
+from coim.learner import Precision, by_run, moments_by_run, share_storage, views
 from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
 from coim.objectives.dynamics import EnsembleNLLLoss
 from coim.objectives.dynamics_gradients import dynamics_gradients
@@ -109,6 +109,15 @@ class DynamicsLearner:
         load_moments(self.optimiser, self._weights, state_dict["moments"])
         self.ensemble.inputs.load_state_dict(state_dict["inputs"])
         self.ensemble.targets.load_state_dict(state_dict["targets"])
+
+    def weights_by_run(self) -> list[Tensor]:
+        """Weights with the run axis first, ``[K, ...]``: views, not copies."""
+        return by_run(self._weights, [*self.ensemble.network.parameters()], self.num_runs)
+
+    def moments_by_run(self) -> list[Tensor]:
+        """Adam's moments, as `weights_by_run` has the weights; none before its first step."""
+        parameters = [*self.ensemble.network.parameters()]
+        return moments_by_run(self.optimiser, self._weights, parameters, self.num_runs)
 
     @torch.no_grad()
     def error(self, rows: TensorDictBase) -> Tensor:

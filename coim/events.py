@@ -5,12 +5,15 @@ Shapes: K runs, D design.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from torch import Tensor
 
 Kind = Literal["first", "optimised", "random", "fixed"]
+Place = tuple[int, int]
+"""A design and one of its episodes, both from 0."""
 
 
 @dataclass(frozen=True)
@@ -22,12 +25,15 @@ class DesignChosen:
         kind: one of the first designs, the optimum of Eq. 5, a random one, or the one body that is fixed throughout.
         design: ``[K, D]``.
         predicted: Eq. 5 at this design before anything is learnt on it, ``[K]``; None while there is no start state.
+        diverged: runs that have diverged, and where (see `coim.divergence`). They keep the body that they have, and
+            their numbers here and in all later events are NaN.
     """
 
     index: int
     kind: Kind
     design: Tensor
     predicted: Tensor | None
+    diverged: Mapping[int, Place] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -43,8 +49,11 @@ class EpisodeDone:
         evaluation_return: undiscounted, of the deterministic individual policy, ``[K]``.
         env_steps: training steps of one run so far; evaluation steps are not counted, nothing is learnt from them.
         imagined: rows in Replay_Art of one run.
-        metrics: means over the updates, each ``[K]``: losses, entropies, ``model_error``.
+        metrics: means over the updates, each ``[K]``: losses, entropies; ``model_error``, and how often the simulation
+            has ``broken`` in the two episodes.
         seconds: wall-clock by part; parts that run side by side overlap, ``episode`` is the whole.
+        diverged: runs that have diverged, and where. One that diverges in this very episode has its losses in
+            ``metrics`` as they came out, and is evaluated with the weights that it had before.
     """
 
     index: int
@@ -57,6 +66,7 @@ class EpisodeDone:
     imagined: int
     metrics: dict[str, Tensor]
     seconds: dict[str, float]
+    diverged: Mapping[int, Place] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -68,12 +78,20 @@ class DesignDone:
         kind: of the design.
         design: ``[K, D]``.
         best_return: highest evaluation return, ``[K]``: the figure of merit of the paper's Fig. 1.
+        diverged: runs that have diverged, and where; on this design, ``best_return`` is the highest until then.
     """
 
     index: int
     kind: Kind
     design: Tensor
     best_return: Tensor
+    diverged: Mapping[int, Place] = field(default_factory=dict)
 
 
 Event = DesignChosen | EpisodeDone | DesignDone
+
+
+def running(event: Event) -> list[int]:
+    """Runs that an event tells of: all but those that had diverged before the design, or before the episode."""
+    place = (event.index, event.episode if isinstance(event, EpisodeDone) else 0)
+    return [run for run in range(len(event.design)) if event.diverged.get(run, place) >= place]

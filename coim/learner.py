@@ -135,6 +135,21 @@ class SACLearner:
         load_moments(self.optimiser, self._weights, state_dict["moments"])
         self.rng.set_state(state_dict["rng"].clone())  # torch reads a view of a larger tensor wrongly
 
+    def weights_by_run(self) -> list[Tensor]:
+        """Weights and targets, each with the run axis first, ``[K, ...]``: views, not copies."""
+        critics = [*self.qvalue.module.mlp.parameters()]
+        return [
+            *by_run(self._weights, self._parameters(), self.num_runs),
+            *by_run(self._targets, critics, self.num_runs),
+        ]
+
+    def moments_by_run(self) -> list[Tensor]:
+        """Adam's moments, as `weights_by_run` has the weights; none before its first step."""
+        return moments_by_run(self.optimiser, self._weights, self._parameters(), self.num_runs)
+
+    def _parameters(self) -> list[Tensor]:
+        return [*self.policy.network.mlp.parameters(), *self.qvalue.module.mlp.parameters()]
+
     @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:
         """One optimiser step and one target update per batch.
@@ -276,6 +291,20 @@ def views(flat: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
     """Consecutive parts of a flat buffer in the shapes of some tensors."""
     parts = flat[: sum(tensor.numel() for tensor in tensors)].split([tensor.numel() for tensor in tensors])
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors)]
+
+
+def by_run(flat: Tensor, tensors: Sequence[Tensor], num_runs: int | None) -> list[Tensor]:
+    """Consecutive parts of a flat buffer in the shapes of some tensors, with a run axis even where there is but one."""
+    found = views(flat.detach(), tensors)
+    return found if num_runs is not None else [part.unsqueeze(0) for part in found]
+
+
+def moments_by_run(
+    optimiser: torch.optim.Optimizer, weights: nn.Parameter, tensors: Sequence[Tensor], num_runs: int | None
+) -> list[Tensor]:
+    """Moments of an optimiser of one flat buffer, as :func:`by_run` has the buffer itself."""
+    moments = [moment for moment in optimiser.state.get(weights, {}).values() if moment.ndim]
+    return [part for moment in moments for part in by_run(moment, tensors, num_runs)]
 
 
 def _network(layers: Sequence[Tensor], index: Any) -> Network:

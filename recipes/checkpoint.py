@@ -25,7 +25,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState, S
 from coim import CoAdaptation
 from recipes.replay_file import ReplayFile
 
-FORMAT = 1  # of what is in a checkpoint; another one is refused
+FORMAT = 2  # of what is in a checkpoint; another one is refused
 CHECKSUMS = "sha256.json"
 PREFIX = "checkpoint"
 KEPT = 2

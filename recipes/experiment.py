@@ -34,6 +34,7 @@ from coim import (
 )
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
+from coim.events import running
 from recipes.checkpoint import Checkpoints
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
@@ -112,8 +113,8 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         + settings.population_updates
         + settings.model_updates * (algorithm.dynamics is not None),
         imagined_share=algorithm.population_parts.imagined / settings.batch_size,
-        done=notes["rows"]["evaluations"] // settings.num_runs if notes else 0,
-        best=float("-inf") if trial is None else float(trial.best.mean()),
+        done=algorithm.env_steps // settings.episode_steps,
+        best=float("-inf") if trial is None else float(trial.best[trial.best.isfinite()].mean().nan_to_num(-torch.inf)),
         quiet=settings.quiet,
     )
     logger = open_wandb(folder, name, settings)
@@ -122,12 +123,14 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         results.write(event, time.perf_counter() - started)
         progress.show(event)
         if logger is not None:
-            log(logger, event, num_runs=settings.num_runs)
+            log(logger, event)
         # A chosen design is saved too: the swarm takes as long as an episode.
         chosen = isinstance(event, DesignChosen)
         if chosen or (isinstance(event, EpisodeDone) and (event.episode + 1) % settings.checkpoint_every == 0):
             checkpoints.save(results.notes())
     progress.end()
+    if algorithm.divergence.everywhere:
+        print("every run has diverged: there is nothing left to learn, and this ends here", file=sys.stderr)
     if not settings.quiet:
         print(results.table())
 
@@ -291,12 +294,12 @@ def open_wandb(folder: Path, environment: str, settings: Settings) -> WandbLogge
     )
 
 
-def log(logger: WandbLogger, event: Event, *, num_runs: int) -> None:
+def log(logger: WandbLogger, event: Event) -> None:
     """The numbers of the CSV files, one series for each run, over training steps."""
     if not isinstance(event, EpisodeDone):
         return
     scalars = {f"seconds/{part}": value for part, value in event.seconds.items()}
-    for run in range(num_runs):
+    for run in running(event):
         scalars[f"run {run}/return"] = float(event.evaluation_return[run])
         scalars[f"run {run}/training return"] = float(event.training_return[run])
         scalars |= {f"run {run}/{key}": float(values[run]) for key, values in event.metrics.items()}

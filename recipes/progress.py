@@ -9,6 +9,7 @@ import time
 from typing import TextIO
 
 from coim import DesignChosen, DesignDone, EpisodeDone
+from coim.events import running
 
 
 class Progress:
@@ -47,10 +48,14 @@ class Progress:
         self._episodes, self._best, self._started = 0, best, time.perf_counter()
 
     def show(self, event: DesignChosen | EpisodeDone | DesignDone) -> None:
-        """Write the line of an episode; other events move the state only."""
+        """Write the line of an episode, and warn of what went wrong in it; other events move the state only."""
         if isinstance(event, DesignChosen):
             self._best = -math.inf
-        if self._quiet or not isinstance(event, EpisodeDone):
+        if not isinstance(event, EpisodeDone):
+            return
+        for sentence in mishaps(event):
+            self.warn(sentence)
+        if self._quiet:
             return
         self._episodes += 1
         last = float(event.evaluation_return.nanmean())
@@ -63,6 +68,11 @@ class Progress:
         else:
             self._stream.write(long + "\n")
         self._stream.flush()
+
+    def warn(self, sentence: str) -> None:
+        """Write a line of its own to standard error, however quiet the run is."""
+        self.end()
+        print(f"warning: {sentence}", file=sys.stderr)
 
     def _lines(self, event: EpisodeDone, last: float) -> tuple[str, str]:
         """The line in full, and in about 75 characters."""
@@ -90,6 +100,24 @@ class Progress:
         if self._live and not self._quiet and self._episodes:
             self._stream.write("\n")
             self._stream.flush()
+
+
+def mishaps(event: EpisodeDone) -> list[str]:
+    """What went wrong in an episode without ending it, a sentence each."""
+    where = f"design {event.index + 1}, episode {event.episode + 1}"
+    found = []
+    for run in running(event):
+        if broken := int(event.metrics.get("broken", {run: 0})[run]):
+            found.append(
+                f"the simulation of run {run} broke {broken} time(s) in {where}; each time it started again from rest"
+            )
+        if run in event.diverged:
+            left = len(event.design) - len(event.diverged)
+            found.append(
+                f"run {run} diverged at {where}: its losses or weights are no finite numbers any more. It is frozen "
+                f"with the weights of before and gets no more rows; {left} of {len(event.design)} run(s) go on"
+            )
+    return found
 
 
 def _clock(seconds: float) -> str:

@@ -97,7 +97,9 @@ def show(picture: Picture) -> str:
 
 def in_short(records: Sequence[Record]) -> str:
     """Where each folder stands, and its best returns: a table by folder, or of one folder by run."""
-    states = "".join(note(f"{record.name}: {state(record)}") for record in records)
+    states = "".join(
+        note(f"{record.name}: {sentence}") for record in records for sentence in (state(record), *ill(record))
+    )
     if len(records) == 1:
         size = len(records[0].designs[0]["xi"])
         head = ["run", "best return", "design", "kind", *(f"xi_{i + 1}" for i in range(size))]
@@ -105,11 +107,18 @@ def in_short(records: Sequence[Record]) -> str:
             [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, row["xi"])]
             for run, row in sorted(records[0].best.items())
         ]
+        if diverged := records[0].diverged:
+            head.append("diverged at")
+            rows = [
+                [*row, diverged[run]["diverged"] if run in diverged else "-"]
+                for run, row in zip(sorted(records[0].best), rows)
+            ]
         if len(rows) > 1:
             mean = statistics.fmean(row["best_return"] for row in records[0].best.values())
-            rows.append([f"mean of {len(rows)} runs", number(mean), *[""] * (2 + size)])
+            rows.append([f"mean of {len(rows)} runs", number(mean), *[""] * (len(head) - 2)])
         return section("Best bodies", states + table(head, rows))
     head = ["folder", "runs", "best return, mean", "standard deviation", "lowest", "highest", "designs", "episodes"]
+    head.append("diverged runs")
     return section("Best returns", states + table(head, [compared(record) for record in records]))
 
 
@@ -121,19 +130,34 @@ def compared(record: Record) -> list[str]:
     designs, episodes = (
         len({(row["design"], row.get("episode")) for row in r}) for r in (record.designs, record.episodes)
     )
-    counts = [str(designs), str(episodes)]
+    counts = [str(designs), str(episodes), str(len(record.diverged))]
     return [record.name, str(record.num_runs), *map(number, (mean, deviation, low, high)), *counts]
 
 
 def state(record: Record) -> str:
     """How far a run is, in a sentence."""
     last: Row = record.episodes[-1]
+    learning = [row for row in record.designs if row["run"] not in record.diverged]
     planned = record.settings.get("num_designs", "?")
     begun = f"started {record.config.get('started', 'at an unknown time')}, {record.num_runs} run(s)"
-    if last["design"] == planned and all(row["finished"] for row in record.designs):
+    if not learning:
+        return f"{begun}; every run has diverged, the last at {last['diverged']}, and it ended there."
+    if last["design"] == planned and all(row["finished"] for row in learning):
         return f"{begun}; all {planned} designs are done, after {last['seconds'] / 60:.3g} min."
     where = f"design {last['design']} of {planned}, episode {last['episode']}"
     return f"{begun}; at {where} after {last['seconds'] / 60:.3g} min: going on, or stopped there."
+
+
+def ill(record: Record) -> list[str]:
+    """What a reader must know of runs that have diverged, and of simulations that broke."""
+    found = [
+        f"run {run} diverged at {row['diverged']}: its losses or weights were no finite numbers any more. It was "
+        "frozen there and has no rows afterwards. Its best return is the best until then; curves over runs are means "
+        "of those that were left."
+        for run, row in sorted(record.diverged.items())
+    ]
+    broken = sum(row.get("broken", 0.0) for row in record.episodes)
+    return [*found, f"{broken:.0f} simulation(s) broke and started again from rest."] if broken > 0 else found
 
 
 def in_full(records: Sequence[Record]) -> list[str]:

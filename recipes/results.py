@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from coim import DesignChosen, DesignDone, EpisodeDone
+from coim.events import running
 from recipes.checkpoint import sync
 from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
@@ -25,7 +26,9 @@ PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "num
 class Results:
     """Writes what happens in a run to its folder, row by row as it comes.
 
-    Designs and episodes count from 1, runs from 0.
+    Designs and episodes count from 1, runs from 0. The row of the episode in which a run diverged, and that of the
+    design, say so in their last column; a run has no rows after them, so that no mean takes one that is frozen for one
+    that learns.
 
     Args:
         folder: made if it does not exist.
@@ -73,12 +76,13 @@ class Results:
                 "env_steps",
                 "model_error",
                 "seconds",
+                "diverged",
             ],
             keep=rows.get("evaluations"),
         )
         self._designs = Table(
             folder / "designs.csv",
-            ["run", "design", "kind", *xi, "predicted", "best_return"],
+            ["run", "design", "kind", *xi, "predicted", "best_return", "diverged"],
             keep=rows.get("designs"),
         )
         self._metrics: Table | None = None  # its columns are known when the first episode is done
@@ -91,27 +95,43 @@ class Results:
             nothing = [None] * len(event.design)
             self._predicted = nothing if event.predicted is None else event.predicted.tolist()
         elif isinstance(event, EpisodeDone):
-            nothing = [None] * len(event.design)
-            errors = event.metrics["model_error"].tolist() if "model_error" in event.metrics else nothing
-            returns = event.training_return.tolist(), event.evaluation_return.tolist()
+            error = event.metrics.get("model_error")
             self._evaluations.append(
-                [run, event.index + 1, event.kind, *xi, event.episode + 1, *scores, event.env_steps, error, seconds]
-                for run, (xi, *scores, error) in enumerate(zip(event.design.tolist(), *returns, errors))
+                [
+                    run,
+                    event.index + 1,
+                    event.kind,
+                    *event.design[run].tolist(),
+                    event.episode + 1,
+                    float(event.training_return[run]),
+                    float(event.evaluation_return[run]),
+                    event.env_steps,
+                    None if error is None else float(error[run]),
+                    seconds,
+                    where_diverged(event, run),
+                ]
+                for run in running(event)
             )
             self._write_metrics(event)
         else:
             self._designs.append(
-                [run, event.index + 1, event.kind, *xi, predicted, best]
-                for run, (xi, predicted, best) in enumerate(
-                    zip(event.design.tolist(), self._predicted, event.best_return.tolist())
-                )
+                [
+                    run,
+                    event.index + 1,
+                    event.kind,
+                    *event.design[run].tolist(),
+                    self._predicted[run],
+                    float(event.best_return[run]),
+                    where_diverged(event, run),
+                ]
+                for run in running(event)
             )
 
     def _write_metrics(self, event: EpisodeDone) -> None:
         """Append what was measured while learning; ``seconds`` are of all runs together, the same in each row."""
         parts = sorted(event.seconds)  # learners side by side book theirs in the order in which they end
         if self._metrics is None:
-            columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in parts)]
+            columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in parts), "diverged"]
             self._metrics = Table(self.folder / "metrics.csv", columns, keep=self._metrics_rows or None)
         seconds = [event.seconds[part] for part in parts]
         self._metrics.append(
@@ -121,8 +141,9 @@ class Results:
                 event.episode + 1,
                 *(float(values[run]) for values in event.metrics.values()),
                 *seconds,
+                where_diverged(event, run),
             ]
-            for run in range(len(event.design))
+            for run in running(event)
         )
         self._metrics_rows = self._metrics.num_rows
 
@@ -139,6 +160,14 @@ class Results:
         """The designs and their best returns, for a terminal."""
         with self._designs.path.open(newline="") as file:
             return "\n".join(format_row(row) for row in csv.reader(file))
+
+
+def where_diverged(event: DesignChosen | EpisodeDone | DesignDone, run: int) -> str | None:
+    """Where a run diverged, as a table and a reader have it; None of one that learns."""
+    if run not in event.diverged:
+        return None
+    index, episode = event.diverged[run]
+    return f"design {index + 1}, episode {episode + 1}"
 
 
 class Table:

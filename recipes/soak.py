@@ -174,10 +174,16 @@ def unequal(one: Any, other: Any, *, path: str) -> Iterator[str]:
         for i, (a, b) in enumerate(zip(one, other)):
             yield from unequal(a, b, path=f"{path}.{i}")
     elif isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
-        if not torch.equal(one, other):
+        if not same_bits(one, other):
             yield path
     elif type(one) is not type(other) or one != other:
         yield path
+
+
+def same_bits(one: torch.Tensor, other: torch.Tensor) -> bool:
+    """Whether two tensors are the same, NaN equal to NaN: a run that has diverged has no other numbers."""
+    bits = [tensor.detach().contiguous().reshape(-1).view(torch.uint8) for tensor in (one, other)]
+    return (one.shape, one.dtype) == (other.shape, other.dtype) and torch.equal(*bits)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from recipes.reporting.palette import GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
+from recipes.reporting.palette import BLACK, GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
 from recipes.reporting.records import Curves, Record, Row, curves
 
 WIDTH = 7.2  # inches: A4 within its margins
@@ -78,8 +78,13 @@ def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> Non
         line = style | ({"color": GREY} if len(records) == 1 and len(found.y) == 1 else {})
         plot_curves(axes, found, label=literal(record.name), **line)
         means = dict(zip(found.x.tolist(), found.mean.tolist()))
-        rows = {row["design"]: row | {column: means.get(row["design"], math.nan)} for row in record.designs}
+        finished = {row["design"] for row in record.designs if row["finished"]}
+        rows = {
+            row["design"]: row | {column: means.get(row["design"], math.nan), "finished": row["design"] in finished}
+            for row in record.designs
+        }
         mark_kinds(axes, list(rows.values()), column, style["color"] if len(records) > 1 else None)
+        mark_divergences(axes, [row for row in record.designs if row["diverged"]], "design", column)
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
@@ -93,6 +98,17 @@ def mark_kinds(axes: Axes, rows: Sequence[Row], column: str, colour: str | None 
                 fill = paint if finished else "white"
                 size = 22 if len(rows) <= MANY_MARKS else 9
                 axes.scatter(*zip(*points), s=size, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
+
+
+def mark_divergences(axes: Axes, rows: Sequence[Row], x: str, y: str) -> None:
+    """A cross where a run diverged."""
+    axes.scatter([row[x] for row in rows], [row[y] for row in rows], s=45, color=BLACK, marker="x", zorder=5)
+
+
+def cross_handles(records: Sequence[Record]) -> list[Line2D]:
+    """Entry of a legend for the crosses, if there are any."""
+    there = any(record.diverged for record in records)
+    return [Line2D([], [], color=BLACK, marker="x", linestyle="", label="run diverged")] if there else []
 
 
 def explain(

@@ -11,9 +11,11 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from recipes.reporting.curves import (
     STEPS,
+    cross_handles,
     episodes_in_a_point,
     explain,
     mark_builds,
+    mark_divergences,
     new_figure,
     plot_curves,
     plot_over_steps,
@@ -40,11 +42,14 @@ def learning_curves(records: Sequence[Record]) -> Picture:
         sampled = curves(records[0].episodes, "env_steps", "training_return").averaged(episodes_in_a_point(records[0]))
         plot_curves(axes, sampled, faint=False, color=SKY, linestyle="-", label="training episode, sampled actions")
         plot_over_steps(axes, records, "return", prefix="evaluation episode, deterministic actions")
-        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+        handles, _ = axes.get_legend_handles_labels()
+        explain(figure, records, mean=False, more=[*handles, *cross_handles(records)])
         caption += " Upright lines: the next body. Faint lines: single runs, where there are several."
     else:
         plot_over_steps(axes, records, "return")
-        explain(figure, records)
+        explain(figure, records, more=cross_handles(records))
+    for record in records:
+        mark_divergences(axes, [*record.diverged.values()], "env_steps", "return")
     axes.set(xlabel=f"{STEPS} (1)", ylabel="return of an episode (1)")
     last = [f"{r.name}: {curves(r.episodes, 'env_steps', 'return').mean[-1:].round(2).tolist()}" for r in records]
     caption += points_in_words(records)
@@ -138,8 +143,7 @@ def times(records: Sequence[Record]) -> Picture:
 
 def time_by_part(record: Record) -> dict[str, float]:
     """Seconds of each part over all episodes so far, and what lies between the episodes."""
-    first = min(row["run"] for row in record.episodes)
-    rows = [row for row in record.episodes if row["run"] == first]
+    rows = [*{(row["design"], row["episode"]): row for row in record.episodes}.values()]  # the same for all runs
     names = [name for name in rows[0] if name.startswith("seconds/")]
     totals = {name.removeprefix("seconds/"): sum(row.get(name, 0.0) for row in rows) for name in names}
     if totals:

@@ -12,7 +12,7 @@ from scipy.stats import spearmanr
 
 from coim import MorphEnv
 from recipes.reporting.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
-from recipes.reporting.curves import explain, mark_kinds, new_figure, plot_over_designs
+from recipes.reporting.curves import cross_handles, explain, mark_kinds, new_figure, plot_over_designs
 from recipes.reporting.palette import GREY, literal, style_of
 from recipes.reporting.records import Record, Row, number
 
@@ -42,7 +42,7 @@ def best_returns(records: Sequence[Record]) -> Picture:
     figure, (axes,) = new_figure(3.4)
     plot_over_designs(axes, records, "best_return")
     axes.set(xlabel="design (number)", ylabel="best return of a design (1)")
-    explain(figure, records, kinds=True)
+    explain(figure, records, kinds=True, more=cross_handles(records))
     tops = [
         f"{r.name}: highest {number(_top(r)['best_return'])} at design {_top(r)['design']}" for r in records if r.best
     ]
@@ -73,7 +73,7 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
     for axes in grid[max(0, size - 2) : size]:
         axes.set(xlabel="design (number)")
         axes.tick_params(labelbottom=True)
-    explain(figure, records, kinds=True)
+    explain(figure, records, kinds=True, more=cross_handles(records))
     bounds = (
         "" if body is None else f" Dashed: the bounds, {body.DESIGN_BOUNDS[0]:.3g} and {body.DESIGN_BOUNDS[1]:.3g}."
     )

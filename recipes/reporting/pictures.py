@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from coim import MorphEnv
 from recipes.reporting.bodies import draw_bodies
-from recipes.reporting.curves import explain, plot_over_designs
+from recipes.reporting.curves import cross_handles, explain, plot_over_designs
 from recipes.reporting.records import read_record
 
 BODIES_SHOWN = 8
@@ -30,7 +30,7 @@ def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
     plot_over_designs(returns, [record], "best_return")
     returns.set(xlabel="design (number)", ylabel="best return of a design (1)")
     returns.spines[["top", "right"]].set_visible(False)
-    explain(figure, [record], kinds=True)
+    explain(figure, [record], kinds=True, more=cross_handles([record]))
     own = [row for row in record.designs if row["run"] == record.designs[0]["run"]]
     best = sorted(own, key=lambda row: row["best_return"])[-BODIES_SHOWN:]
     draw_bodies(bodies, sorted(best, key=lambda row: row["design"]), body)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 Row = dict[str, Any]
-WORDS = ("kind",)  # cells that are not numbers
+WORDS = ("kind", "diverged")  # cells that are not numbers
 COUNTS = ("run", "design", "episode", "env_steps")
 
 
@@ -28,7 +28,8 @@ class Record:
         name: what the report calls it.
         config: ``config.json``.
         episodes: rows of ``evaluations.csv``, each with the cells that ``metrics.csv`` has for it.
-        designs: a row per run and design, also of those under way: run, design, kind, xi, best_return, predicted.
+        designs: a row per run and design, also of those under way: run, design, kind, xi, best_return, predicted,
+            diverged, and whether it is finished, which it is not where the run diverged.
     """
 
     name: str
@@ -50,6 +51,11 @@ class Record:
     def num_runs(self) -> int:
         """Runs that have a return."""
         return len({row["run"] for row in self.episodes if math.isfinite(row["return"])})
+
+    @property
+    def diverged(self) -> dict[int, Row]:
+        """The last episode of each run that has diverged; its ``diverged`` says where."""
+        return {row["run"]: row for row in self.episodes if row.get("diverged")}
 
     @property
     def best(self) -> dict[int, Row]:
@@ -178,10 +184,11 @@ def best_of_designs(episodes: Sequence[Row], finished: Sequence[Row]) -> list[Ro
     for row in episodes:
         key = (row["run"], row["design"])
         if key not in designs:
-            known = {"predicted": predicted.get(key, math.nan), "finished": key in predicted}
+            known = {"predicted": predicted.get(key, math.nan), "best_return": row["return"]}
             designs[key] = {name: row[name] for name in ("run", "design", "kind", "xi")} | known
-            designs[key]["best_return"] = row["return"]
-        designs[key]["best_return"] = float(np.fmax(designs[key]["best_return"], row["return"]))
+        diverged = row.get("diverged", "")
+        found = designs[key] | {"diverged": diverged, "finished": key in predicted and not diverged}
+        designs[key] = found | {"best_return": float(np.fmax(found["best_return"], row["return"]))}
     return list(designs.values())
 
 

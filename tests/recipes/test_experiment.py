@@ -57,7 +57,10 @@ def test_what_was_measured_while_learning_has_a_row_for_each_run_and_episode(tmp
     losses = {f"{who}/{what}" for who in ("individual", "population") for what in ("loss_actor", "loss_qvalue")}
     parts = {"collect", "imagine", "train individual", "train population", "train model", "evaluate", "episode"}
     measured = {"model_error", "model/loss_dynamics", "individual/entropy", "population/entropy"} | losses
-    assert rows[0].keys() == {"run", "design", "episode"} | measured | {f"seconds/{part}" for part in parts}
+    assert rows[0].keys() == {"run", "design", "episode", "broken", "diverged"} | measured | {
+        f"seconds/{part}" for part in parts
+    }
+    assert {row.pop("diverged") for row in rows} == {""}
     assert all(float(value) == float(value) for row in rows for value in row.values())  # numbers, none of them NaN
     evaluations = read(tmp_path / "fleet" / "evaluations.csv")
     assert [row["model_error"] for row in rows] == [row["model_error"] for row in evaluations]
@@ -140,7 +143,7 @@ def test_a_preset_moves_defaults_and_options_win_over_it() -> None:
     quick = parse("prog", "", ["--preset", "quick"])
     assert quick == PRESETS["quick"]
     assert parse("prog", "", ["--preset", "quick", "--episodes", "9"]).episodes == 9
-    assert parse("prog", "", []) == Settings()
+    assert parse("prog", "", []) == PRESETS["paper"]
 
 
 def test_every_setting_has_a_sentence_of_help(capsys: pytest.CaptureFixture) -> None:

@@ -167,12 +167,13 @@ def test_a_run_from_before_there_were_metrics_has_a_page(runs: Path, tmp_path: P
 
 def test_numbers_that_are_none_are_gaps(runs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(runs / "fleet", tmp_path / "run")
+    kept = ("run", "design", "kind", "episode", "env_steps", "diverged")
     for name in ("evaluations.csv", "metrics.csv", "designs.csv"):
         head, *rows = (folder / name).read_text().splitlines()
         columns = head.split(",")
         broken = [
             row if row[0] != "1" else ",".join(
-                cell if column in ("run", "design", "kind", "episode", "env_steps") or column.startswith(("xi", "sec"))
+                cell if column in kept or column.startswith(("xi", "sec"))
                 else "nan" for column, cell in zip(columns, row.split(","))
             ) for row in rows
         ]  # fmt: skip

@@ -92,7 +92,7 @@ def test_a_file_that_is_no_study_is_named(tmp_path: Path, text: str, sentence: s
 
 def test_the_preview_has_the_papers_networks_batches_and_updates() -> None:
     preview, paper = PROTOCOLS["preview"], PROTOCOLS["paper"]
-    cheaper = {"num_designs", "first_episodes", "episodes", "search", "precision"}
+    cheaper = {"num_designs", "first_episodes", "episodes", "search"}
     assert dataclasses.replace(paper, **{name: getattr(preview, name) for name in cheaper}) == preview
     assert preview.num_designs >= 5 + 8
     assert len(STUDIES["preview"].cells()) == 4 * 5 + 2 * 3
