@@ -141,14 +141,13 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
     seen = joined(probed.seen)[:, 0]
     tried = torch.stack([rows["design"][0, 0] for rows in probed.seen])
     chosen = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))[:STATES]
-    models, variance = {}, change_variance(probed.learners["delta"])
+    models, variance = {}, change_variance(probed.learners["delta"])  # the run axis is dropped from both
     for predict, learner in sorted(probed.learners.items()):
         models[predict] = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, 0)
     variance = variance if variance.ndim == 1 else variance[0]
+    simulator, bounds = probed.probes.simulator, body.DESIGN_BOUNDS
     try:
-        rows = design_space(
-            models, probed.probes.simulator, seen[chosen], tried, variance, body.DESIGN_BOUNDS, side=SIDE
-        )
+        rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)
     except ValueError as error:
         return f"no {FILE}: {error}"
     text = io.StringIO()

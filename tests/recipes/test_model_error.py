@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from interrupted_runs import TINY, PowerCut, no_picture
 from interrupted_runs import run as run_alone
+from tensordict import TensorDict
 
-from coim import HopperMorph
+from coim import HopperMorph, Policy
 from recipes.checkpoint import Checkpoints
 from recipes.model_error import main, probe
 from recipes.plots import design_space, model_error
@@ -111,6 +113,25 @@ def test_both_models_learn_from_the_same_batches(tmp_path: Path, monkeypatch: py
     list(measured)
     for key, value in own.ensemble.state_dict().items():
         assert torch.equal(value, other.ensemble.state_dict()[key]), key
+
+
+def test_each_probe_is_driven_by_the_policy_that_it_tells_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = probe(HopperMorph, Settings(**{**vars(TINY), "num_designs": 2}), tmp_path, every=2, rows=4)
+    drivers = []
+    for name in ("trajectory", "unseen_trajectories"):
+        collect = getattr(measured.probes, name)
+
+        def noted(policy: Policy, *args: torch.Tensor, collect: Callable = collect, **kwargs: int) -> TensorDict:
+            drivers.append(policy)
+            return collect(policy, *args, **kwargs)
+
+        monkeypatch.setattr(measured.probes, name, noted)
+    list(measured)
+    individual, population = measured.individual.policy, measured.population.policy
+    seen, next_design, never_built = individual, population, population
+    assert [driver is individual for driver in drivers] == [
+        driver is individual for driver in (seen, never_built, next_design, seen, never_built)
+    ]
 
 
 def test_a_fleet_has_a_row_for_each_run(tmp_path: Path) -> None:
