@@ -33,7 +33,7 @@ def plots(study: Path) -> Iterator[Plot]:
     folders = folders_with(study, FILE)
     if not folders:
         line = f"python -m recipes.model_error ENVIRONMENT --out {study / FOLDER}"
-        yield missing("fig4b_design_space", f"No model was looked into at the end of its run: {line}")
+        yield missing("figure_4b_design_space", f"No model was looked into at the end of its run: {line}")
     for folder in folders:
         environment, rows = read_config(folder)["environment"], read(folder / FILE)
         states = sorted({int(row["state"]) for row in rows})
@@ -52,7 +52,7 @@ def plots(study: Path) -> Iterator[Plot]:
         bar.set_label("squared change of the next state\n(variances of one-step changes, 1)")
         put_legend(figure, handles())
         caption = describe(environment, rows)
-        yield Plot(name=f"fig4b_design_space_{environment}", figure=figure, rows=rows, caption=caption)
+        yield Plot(name=f"figure_4b_design_space_{environment}", figure=figure, rows=rows, caption=caption)
 
 
 def draw(axes: Axes, rows: Sequence[Row], source: str) -> QuadMesh:

@@ -57,7 +57,7 @@ def plots(study: Path) -> Iterator[Plot]:
     folders = folders_with(study, FILE)
     if not folders:
         line = f"python -m recipes.model_error ENVIRONMENT --out {study / FOLDER}"
-        yield missing("fig4a_model_error", f"No model error was measured: {line}")
+        yield missing("figure_4a_model_error", f"No model error was measured: {line}")
     for folder in folders:
         environment, rows = read_config(folder)["environment"], read(folder / FILE)
         figure, grid = new_figure(6.4, len(UNITS), len(MODELS), sharex=True)
@@ -76,7 +76,7 @@ def plots(study: Path) -> Iterator[Plot]:
         measured = {row["probe"] for row in rows}
         put_legend(figure, list(handles(measured)))
         caption = describe(environment, rows)
-        yield Plot(name=f"fig4a_model_error_{environment}", figure=figure, rows=rows, caption=caption)
+        yield Plot(name=f"figure_4a_model_error_{environment}", figure=figure, rows=rows, caption=caption)
 
 
 def draw(axes: Axes, rows: Sequence[Row], model: str, unit: str) -> None:

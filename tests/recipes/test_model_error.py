@@ -173,7 +173,7 @@ def test_too_few_designs_for_two_components_are_told(tmp_path: Path, capsys: pyt
 
 def test_the_figures_show_what_was_measured(study: Path) -> None:
     (errors,), (space,) = model_error.plots(study), design_space.plots(study)
-    assert (errors.name, space.name) == ("fig4a_model_error_hopper", "fig4b_design_space_hopper")
+    assert (errors.name, space.name) == ("figure_4a_model_error_hopper", "figure_4b_design_space_hopper")
     measured = read(study / "model_error" / "model_error.csv")
     assert [dict(row) for row in errors.rows] == measured
     panels = errors.figure.axes
