@@ -15,6 +15,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 
 from recipes.plots.model_error import FOLDER, Row, folders_with, read
 from recipes.plots.plot import Plot, missing
@@ -70,8 +71,9 @@ def draw(axes: Axes, rows: Sequence[Row], source: str) -> QuadMesh:
         axes.contourf(x, y, depth, levels=[IN_THE_FLOOR, np.inf], colors="none", hatches=["////"])
         axes.contour(x, y, depth, levels=[IN_THE_FLOOR], colors="white", linewidths=0.8)
     tried = [(float(row["pc_1"]), float(row["pc_2"])) for row in rows if row["point"] == "tried"]
-    axes.plot(*zip(*tried), "x", color="white", markersize=3.5, markeredgewidth=0.8)
-    axes.plot(0, 0, "o", **CIRCLE)
+    around = [withStroke(linewidth=2, foreground="grey")]  # a cross may lie beyond the plane's bounds, on white
+    axes.plot(*zip(*tried), "x", color="white", markersize=3.5, markeredgewidth=0.8, path_effects=around)
+    axes.plot(0, 0, "o", clip_on=False, **CIRCLE)
     axes.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     return mesh
 
