@@ -18,7 +18,7 @@ import torch
 from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, select_run
 from recipes.experiment import build, check_origin, follow
 from recipes.interrupt import Stopped, locked, stopping_at_once
-from recipes.machine import available_cores, checked_device, prepare
+from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.probing.design_space import FILE, SIDE, design_space
 from recipes.probing.errors import change_variance
 from recipes.probing.probed import ProbedCoAdaptation, other_learner
@@ -87,6 +87,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings, *, every: int, rows
     """
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
+    if settings.compile:
+        check_compiler()
     folder = settings.resume or settings.out or default_folder(name, settings)
     if settings.resume is None:
         refuse_filled(folder)
@@ -123,7 +125,11 @@ def probe(
     """Build the run as its recipe does, and put a second model and the probes beside it."""
     algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
     learner = other_learner(
-        algorithm, lr=settings.model_lr, weight_decay=settings.weight_decay, precision=settings.precision
+        algorithm,
+        lr=settings.model_lr,
+        weight_decay=settings.weight_decay,
+        precision=settings.precision,
+        compile=settings.compile,
     )
     probes = Probes(
         body,
