@@ -144,6 +144,8 @@ def probe(
 
 def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder: Path) -> str:
     """Fig. 4(b)'s numbers of the first run, from its models as they are at the end; returns what happened in words."""
+    if not probed.seen:
+        return f"no {FILE}: the run ended before its first measurement"
     seen = joined(probed.seen)[:, 0]
     tried = torch.stack([rows["design"][0, 0] for rows in probed.seen])
     chosen = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))[:STATES]

@@ -42,7 +42,7 @@ def principal_directions(designs: Tensor) -> tuple[Tensor, Tensor]:
     centred = designs.double() - designs.double().mean(0)
     _, sizes, directions = torch.linalg.svd(centred, full_matrices=False)
     if len(sizes) < 2 or sizes[1] < 1e-6:
-        raise ValueError(f"{len(designs)} designs lie on a line; two principal components need three that do not")
+        raise ValueError(f"designs on one line, {len(designs)} in all, have no second component; try three or more")
     largest = directions[:2].gather(1, directions[:2].abs().argmax(1, keepdim=True))
     # + 0.0 turns a negative zero into a zero.
     return (directions[:2] * largest.sign() + 0.0).float(), (sizes.square() / sizes.square().sum())[:2].float()

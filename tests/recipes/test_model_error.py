@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from coim import HopperMorph, Policy
 from recipes.checkpoint import Checkpoints
-from recipes.model_error import main, probe
+from recipes.model_error import main, probe, write_design_space
 from recipes.plots import design_space, model_error
 from recipes.probing import probed
 from recipes.settings import Settings
@@ -167,8 +167,14 @@ def test_too_few_designs_for_two_components_are_told(tmp_path: Path, capsys: pyt
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("test_model_error.OPTIONS", options)
         measure(tmp_path / "one", "--num-designs", "1")
-    assert "no design_space.csv: 1 designs lie on a line" in capsys.readouterr().out
+    assert "no design_space.csv: designs on one line, 1 in all" in capsys.readouterr().out
     assert [plot.figure for plot in design_space.plots(tmp_path)] == [None]
+
+
+def test_a_run_that_ended_before_anything_was_measured_says_so(tmp_path: Path) -> None:
+    measured = probe(HopperMorph, TINY, tmp_path, every=2, rows=4)
+    assert "before its first measurement" in write_design_space(measured, HopperMorph, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_figures_show_what_was_measured(study: Path) -> None:

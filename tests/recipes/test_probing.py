@@ -173,7 +173,7 @@ def test_the_plane_goes_through_the_design_and_fills_the_bounds() -> None:
 
 
 def test_designs_on_a_line_have_no_second_component() -> None:
-    with pytest.raises(ValueError, match="3 designs lie on a line"):
+    with pytest.raises(ValueError, match="designs on one line, 3 in all"):
         principal_directions(torch.tensor([[1.0, 1.0], [1.5, 1.5], [2.0, 2.0]]))
 
 
