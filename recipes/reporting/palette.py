@@ -17,6 +17,7 @@ BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "
 KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s"), "fixed": (ORANGE, "D")}
 DASHES = ("-", "--", ":")
 CHARACTERS = 120  # of a legend, side by side on a page
+CIRCLE = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "magenta", "markeredgewidth": 2}  # as Fig. 4
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
 

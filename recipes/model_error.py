@@ -1,0 +1,170 @@
+"""Fig. 4(a) and (b): how well the learnt dynamics know bodies, over the training of one run.
+
+``python -m recipes.model_error ENVIRONMENT --out STUDY_FOLDER/model_error`` follows Algorithm 1 as the environment's
+own recipe does and measures on the way; the same line again goes on with a run that was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, select_run
+from recipes.experiment import build, check_origin, follow
+from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.machine import available_cores, check_compiler, checked_device, prepare
+from recipes.probing.design_space import FILE, SIDE, design_space
+from recipes.probing.errors import change_variance
+from recipes.probing.probed import ProbedCoAdaptation, other_learner
+from recipes.probing.probes import Probes, joined
+from recipes.report import write_report
+from recipes.reporting.pictures import draw_run
+from recipes.results import default_folder, refuse_filled, write_whole
+from recipes.settings import Settings, parse
+
+BODIES: dict[str, type[MorphEnv]] = {
+    "half_cheetah": HalfCheetahMorph,
+    "hopper": HopperMorph,
+    "walker": WalkerMorph,
+}
+STATES = 3  # of which Fig. 4(b) is drawn, at random
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line: the environment, two options of its own, and every setting of the environment's recipe."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    own = argparse.ArgumentParser(
+        prog="python -m recipes.model_error", description=__doc__, add_help=False, allow_abbrev=False
+    )
+    own.add_argument("environment", choices=BODIES)
+    own.add_argument("--every", type=int, default=10, help="episodes of a design between two measurements (10)")
+    own.add_argument("--rows", type=int, default=200, help="transitions in each measurement (200)")
+    own.add_argument("--out", type=Path, help="folder; one that holds such a run is gone on with")
+    if {"-h", "--help"} & {*given}:
+        print(own.format_help())
+        given = [name for name in given if name in BODIES][:1] or ["hopper"]
+        given.append("--help")  # the recipe's settings follow
+    asked, rest = own.parse_known_args(given)
+    try:
+        for name in ("every", "rows"):
+            if getattr(asked, name) < 1:
+                raise ValueError(f"--{name} is {getattr(asked, name)}, it must be at least 1")
+        settings = parse(f"{own.prog} {asked.environment}", str(__doc__), [*folder_options(asked.out), *rest])
+        run(BODIES[asked.environment], asked.environment, settings, every=asked.every, rows=asked.rows)
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+def folder_options(out: Path | None) -> list[str]:
+    """The recipe's own words for a folder: gone on with where there is a run, or made."""
+    if out is None:
+        return ["--name", "model_error"]
+    return ["--resume" if (out / "config.json").exists() else "--out", str(out)]
+
+
+def run(body: type[MorphEnv], name: str, settings: Settings, *, every: int, rows: int) -> Path:
+    """Train and measure; leave an ordinary run's folder with two CSV files more.
+
+    Args:
+        body: the environment.
+        name: of the environment.
+        settings: of the run; ``resume`` names the folder of one to go on with.
+        every: episodes of a design between two measurements.
+        rows: transitions in each of them.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: if the settings learn no model.
+        SystemExit: on Ctrl-C or SIGTERM.
+    """
+    threads = settings.threads or available_cores()
+    side_by_side = prepare(threads, checked_device(settings.device))
+    if settings.compile:
+        check_compiler()
+    folder = settings.resume or settings.out or default_folder(name, settings)
+    if settings.resume is None:
+        refuse_filled(folder)
+    else:
+        check_origin(folder, name)
+    probed = probe(body, settings, folder, every=every, rows=rows, threads=threads, side_by_side=side_by_side)
+    again = f"to go on: the same line with --out {folder}"
+    with locked(folder):
+        try:
+            with stopping_at_once():
+                follow(probed, folder, name, settings)
+                note = write_design_space(probed, body, folder)
+        except Stopped as stop:
+            print(f"\n{stop}; {again}", file=sys.stderr)
+            sys.exit(128 + stop.signum)
+        except OSError as error:
+            raise OSError(f"{error}; {again}") from error
+    draw_run(folder, body), write_report([folder], body=body)
+    if not settings.quiet:
+        print(f"{note}\nto draw it: python -m recipes.figures {folder.parent}")
+    return folder
+
+
+def probe(
+    body: type[MorphEnv],
+    settings: Settings,
+    folder: Path,
+    *,
+    every: int,
+    rows: int,
+    threads: int = 1,
+    side_by_side: bool = False,
+) -> ProbedCoAdaptation:
+    """Build the run as its recipe does, and put a second model and the probes beside it."""
+    algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
+    learner = other_learner(
+        algorithm,
+        lr=settings.model_lr,
+        weight_decay=settings.weight_decay,
+        precision=settings.precision,
+        compile=settings.compile,
+    )
+    probes = Probes(
+        body,
+        num_runs=settings.num_runs,
+        episode_steps=settings.episode_steps,
+        num_rows=rows,
+        num_threads=threads,
+        device=checked_device(settings.device),
+    )
+    return ProbedCoAdaptation(algorithm, learner, probes, folder, every=every, sigma=settings.sigma, seed=settings.seed)
+
+
+def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder: Path) -> str:
+    """Fig. 4(b)'s numbers of the first run, from its models as they are at the end; returns what happened in words."""
+    if not probed.seen:
+        return f"no {FILE}: the run ended before its first measurement"
+    seen = joined(probed.seen)[:, 0]
+    tried = torch.stack([rows["design"][0, 0] for rows in probed.seen])
+    chosen = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))[:STATES]
+    models, variance = {}, change_variance(probed.learners["delta"])  # the run axis is dropped from both
+    for predict, learner in sorted(probed.learners.items()):
+        models[predict] = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, 0)
+    variance = variance if variance.ndim == 1 else variance[0]
+    simulator, bounds = probed.probes.simulator, body.DESIGN_BOUNDS
+    try:
+        rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)
+    except ValueError as error:
+        return f"no {FILE}: {error}"
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
+    write_whole(folder / FILE, text.getvalue())
+    return f"model errors: {probed.path}\ndesign space: {folder / FILE}"
+
+
+if __name__ == "__main__":
+    main()
