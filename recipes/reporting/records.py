@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 Row = dict[str, Any]
-WORDS = ("kind",)  # cells that are not numbers
+WORDS = ("kind", "diverged")  # cells that are not numbers
 COUNTS = ("run", "design", "episode", "env_steps")
 
 
