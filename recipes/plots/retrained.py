@@ -45,7 +45,7 @@ def results(folder: Path, listed: Sequence[dict[str, str]]) -> list[Cells]:
     over: list[tuple[dict[str, str], Run]] = []
     for line in listed:
         found = runs_of_folder(
-            folder / line["folder"], line["environment"], line["task"], line["arm"], int(line["seed"])
+            folder / "cells" / line["folder"], line["environment"], line["task"], line["arm"], int(line["seed"])
         )
         over += [(line, run) for run in found if run.over]
     lowest: dict[tuple[str, str], float] = {}
