@@ -17,7 +17,9 @@ from recipes.reporting.records import Row
 
 Cells = dict[str, object]
 MEASURES = ("area", "final")
-BASELINES = {"none": None, "known": ("noisy", "random", "oracle")}  # against whom; None: everybody else
+# Against whom: everybody against the baseline; what imagines unseen bodies against what imagines seen ones; the
+# simulator that imagines random bodies against the model that does.
+BASELINES = {"none": None, "known": ("noisy", "random"), "random": ("oracle",)}
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ def measure(run: Run, failure: float) -> Measured:
     pairs = predictions(run)
     settings, rows = run.record.settings, [row for row in run.record.episodes if row["run"] == run.number]
     an_episode = settings["individual_updates"] + settings["population_updates"]
-    an_episode += settings["model_updates"] * (settings["designs"] != "none")
+    learns_model = settings["designs"] != "none" and settings.get("dream") != "simulator"
+    an_episode += settings["model_updates"] * learns_model
     correlation = rank_correlation(pairs)
     return Measured(
         run,
@@ -83,7 +86,7 @@ def predictions(run: Run) -> list[Row]:
 
 
 def pairs_of_arms(arms: Sequence[str]) -> list[tuple[str, str]]:
-    """Who is compared with whom: every arm with the baseline, and what imagines other designs with known ones."""
+    """Who is compared with whom, by `BASELINES`."""
     return [
         (arm, against)
         for against, whom in BASELINES.items()

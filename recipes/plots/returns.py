@@ -25,7 +25,8 @@ STATISTICS: dict[str, Statistic] = {"mean": mean, "IQM": iqm}
 PANEL = (3.6, 2.3)  # inches
 CAPTION = (
     "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
-    "over the evaluation episodes on it. Faint: single runs. Strong: their mean and their interquartile mean (IQM). "
+    "over the evaluation episodes on it. Faint: single runs. Strong: mean and interquartile mean (IQM) of those "
+    "that have reached the design. "
     f"Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
     "environment, task and arm). "
 )

@@ -96,6 +96,10 @@ class Runs:
         """All that are planned."""
         return in_order(arm for _, _, arm in self.planned)
 
+    def arms_at(self, place: Place) -> list[str]:
+        """All that are planned in one environment and task."""
+        return [arm for arm in self.arms if self.planned[*place, arm]]
+
     def of(self, place: Place, arm: str) -> list[Run]:
         """Those of one environment, task and arm, by seed."""
         runs = [run for run in self.found if (run.environment, run.task, run.arm) == (*place, arm)]

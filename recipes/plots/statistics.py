@@ -18,7 +18,7 @@ from recipes.plots.runs import Place, Runs, read_runs
 from recipes.reporting.curves import new_figure
 from recipes.reporting.palette import BLACK, GREY, put_legend
 
-LABELS = {"area": "area under the best-return curve\nover designs (1)", "final": "highest best return (1)"}
+LABELS = {"area": "area: mean best return of a design (1)", "final": "final: highest best return (1)"}
 INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
 
 
@@ -39,7 +39,7 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
         own = [m for m in measured if (m.run.environment, m.run.task) == place]
         if any(m.run.over and math.isfinite(m.final) for m in own):
             places.append(place)
-            rows += [summary(runs, place, arm, [m for m in own if m.run.arm == arm]) for arm in runs.arms]
+            rows += [summary(runs, place, arm, [m for m in own if m.run.arm == arm]) for arm in runs.arms_at(place)]
     if not places:
         return missing("statistics_arms", f"No run has tried all its designs yet. {runs.in_words(runs.arms)}")
     figure, grid = new_figure(0.4 + 2.4 * len(places), len(places), len(MEASURES))
@@ -78,7 +78,7 @@ def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cell
 
 def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequence[Measured]) -> None:
     """One measure of every arm of one environment and task."""
-    for x, arm in enumerate(runs.arms):
+    for x, arm in enumerate(runs.arms_at(place)):
         here = [m for m in measured if (m.run.environment, m.run.task) == place and m.run.arm == arm and m.run.over]
         values, colour = np.array([getattr(m, name) for m in here]), styles.style(arm)["color"]
         if not here:
@@ -89,8 +89,14 @@ def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequenc
         axes.vlines(x, low, high, color=colour, linewidth=2.5)
         axes.hlines(iqm(values), x - 0.3, x + 0.3, color=colour, linewidth=2.5)
         axes.hlines(mean(values), x - 0.3, x - 0.18, color=BLACK, linewidth=1)
-    axes.set(xticks=range(len(runs.arms)), xticklabels=runs.arms, ylabel=LABELS[name], title=", ".join(place))
-    axes.tick_params(axis="x", rotation=30 if len(runs.arms) > 4 else 0)
+    name_arms(axes, runs.arms_at(place))
+    axes.set(ylabel=LABELS[name], title=", ".join(place))
+
+
+def name_arms(axes: Axes, arms: Sequence[str]) -> None:
+    """Names below the columns; slanted where there is no room for them side by side."""
+    slanted = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if len(arms) > 4 else {}
+    axes.set_xticks(range(len(arms)), arms, **slanted)
 
 
 def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
@@ -175,14 +181,14 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
     labels = {"hours": "wall-clock of the cell (h)", "updates": "updates (number)"}
     for axes, (place, name) in zip(grid, ((place, name) for place in places for name in labels)):
         here = [m for m in measured if (m.run.environment, m.run.task) == place]
-        for x, arm in enumerate(runs.arms):
+        for x, arm in enumerate(runs.arms_at(place)):
             values = [getattr(m, name) for m in here if m.run.arm == arm]
             spread = x + np.linspace(-0.25, 0.25, len(values) + 2)[1:-1]
             paint = {"color": styles.style(arm)["color"], "marker": styles.MARKERS.get(arm, "o")}
             axes.scatter(spread, values, s=14, alpha=0.7, linewidth=0, **paint)
-        axes.set(xticks=range(len(runs.arms)), xticklabels=runs.arms, ylabel=labels[name], title=", ".join(place))
+        name_arms(axes, runs.arms_at(place))
+        axes.set(ylabel=labels[name], title=", ".join(place))
         axes.set_ylim(0, 1.1 * max(getattr(m, name) for m in here))
-        axes.tick_params(axis="x", rotation=30 if len(runs.arms) > 4 else 0)
     caption = (
         "What every run took, also those under way: wall-clock of its cell, whatever else the machine did meanwhile, "
         f"and updates of both learners and the ensemble together. {runs.in_words(runs.arms)}"

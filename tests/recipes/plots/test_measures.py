@@ -26,9 +26,10 @@ def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> 
     assert found.updates == 8 * (5 + 3 + 2)
 
 
-def test_the_baseline_has_no_updates_of_a_model(tmp_path: Path) -> None:
+def test_who_learns_no_model_has_no_updates_of_it(tmp_path: Path) -> None:
     write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], designs="none")
-    assert measure(read_runs(tmp_path).found[0], failure=0).updates == 8 * (5 + 3)
+    write_cell(tmp_path, "hopper-forward-oracle-0", [10, 40, 20, 30], dream="simulator")
+    assert [measure(run, failure=0).updates for run in read_runs(tmp_path).found] == [8 * (5 + 3)] * 2
 
 
 def test_a_diverged_run_counts_with_the_lowest_return_of_its_place_on_what_it_did_not_reach(tmp_path: Path) -> None:
@@ -77,13 +78,14 @@ def test_a_cell_of_another_name_is_refused_and_so_is_a_folder_without_cells(tmp_
         read_runs(tmp_path)
 
 
-def test_every_arm_meets_the_baseline_and_what_imagines_other_designs_meets_known() -> None:
-    assert pairs_of_arms(["none", "known", "noisy", "oracle"]) == [
+def test_every_arm_meets_the_baseline_and_each_way_to_imagine_the_one_that_it_changes() -> None:
+    assert pairs_of_arms(["none", "known", "random", "control-only", "oracle"]) == [
         ("known", "none"),
-        ("noisy", "none"),
+        ("random", "none"),
+        ("control-only", "none"),
         ("oracle", "none"),
-        ("noisy", "known"),
-        ("oracle", "known"),
+        ("random", "known"),
+        ("oracle", "random"),
     ]
 
 
