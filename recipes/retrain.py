@@ -15,6 +15,7 @@ import csv
 import dataclasses
 import io
 import math
+import signal
 import sys
 import zlib
 from collections.abc import Iterator, Sequence
@@ -52,6 +53,8 @@ class Retrain:
     """Designs at once on this machine, each on one core; 0 takes as many as there are cores."""
     ray_address: str | None = None
     """A Ray cluster, such as auto or 10.0.0.1:6379; by default this machine."""
+    gpus: float = 0.0
+    """Share of a GPU for each; above 0 its networks live there, wherever those of the study did."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         sys.exit(f"{type(error).__name__}: {error}")
     except KeyboardInterrupt as stop:
-        print(f"\n{stop if isinstance(stop, Stopped) else 'stopped'}; run it again to go on", file=sys.stderr)
-        sys.exit(128 + (stop.signum if isinstance(stop, Stopped) else 2))
+        signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
+        print(f"\n{Stopped(signum)}; the same command goes on", file=sys.stderr)
+        sys.exit(128 + signum)
     if failed:
         sys.exit(f"failed: {', '.join(failed)}; see {asked.study}/retrained/ledger.csv")
 
@@ -107,16 +111,16 @@ def retrain(asked: Retrain) -> list[str]:
         workers = asked.workers or available_cores()
         # Ray takes SIGTERM for itself when it starts.
         with ray_running(address=asked.ray_address, workers=workers), stopping_at_once():
-            return Conductor(folder, cells, ledger, Resources()).conduct()
+            return Conductor(folder, cells, ledger, Resources(gpus=asked.gpus)).conduct()
 
 
 def check(asked: Retrain) -> None:
     """Refuse what cannot be done."""
     if not 0 < asked.top <= 1:
         raise ValueError(f"--top is {asked.top}, a share of the designs lies in (0, 1]; Fig. 2 has 0.5")
-    for name in ("most", "episodes"):
-        if (value := getattr(asked, name)) is not None and value < 1:
-            raise ValueError(f"--{name} is {value}, it must be at least 1")
+    for name, least in (("most", 1), ("episodes", 1), ("workers", 0), ("gpus", 0)):
+        if (value := getattr(asked, name)) is not None and value < least:
+            raise ValueError(f"--{name} is {value}, it must be at least {least}")
 
 
 def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
@@ -184,6 +188,7 @@ def cell_of(line: dict[str, str], asked: Retrain) -> Retraining:
         individual_mix=0.0,
         individual_imagined_share=0.0,
         seed=zlib.crc32(line["folder"].encode()),  # of its own, so that no two samples share initial weights
+        device="cpu",
         resume=None,
         name="retrained",
         wandb="off",
