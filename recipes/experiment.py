@@ -218,7 +218,9 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         individual=individual,
         buffers=make_buffers(env, settings, seed=next(seeds)),
         search=make_search(env, settings, seed=next(seeds)),
-        first_designs=torch.tensor(body.FIRST_DESIGNS, device=device),
+        first_designs=torch.tensor(
+            [settings.first_design] if settings.first_design else body.FIRST_DESIGNS, device=device
+        ),
         bodies=settings.bodies,
         dynamics=dynamics,
         dream=dream,

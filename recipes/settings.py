@@ -27,6 +27,8 @@ class Settings:
     """Who imagines: the learnt ensemble, or the simulator itself, which tells the ensemble's error from the rest."""
     bodies: Literal["search", "random", "fixed"] = "search"
     """Bodies after the first ones: optimised and random in turn, all random, or the body as drawn from start to end."""
+    first_design: tuple[float, ...] = ()
+    """One body to begin with, as scale factors, instead of the environment's own five."""
     sigma: float = 0.1
     """Standard deviation of the noisy designs, in scale factors (Sec. 6.4)."""
     seed: int = 0
@@ -225,6 +227,7 @@ def refuse_changes(old: Settings, new: Settings) -> None:
         )
 
 
-def episodes_of(settings: Settings, index: int, *, num_first: int = 5) -> int:
+def episodes_of(settings: Settings, index: int) -> int:
     """Training episodes of one design."""
+    num_first = 1 if settings.first_design else 5
     return settings.first_episodes if index < num_first else settings.episodes

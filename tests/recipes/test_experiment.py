@@ -187,3 +187,10 @@ def test_a_simulator_without_designs_to_imagine_is_refused(capsys: pytest.Captur
     with pytest.raises(SystemExit):
         parse("hopper", "", ["--dream", "simulator", "--designs", "none"])
     assert "nothing to imagine with" in capsys.readouterr().err
+
+
+def test_a_run_can_begin_with_one_body_of_its_own(tmp_path: Path) -> None:
+    run(tmp_path, "--first-design", "0.8", "1.2", "1", "1.5", "--num-designs", "2", "--first-episodes", "2", "--quiet")
+    rows = read(tmp_path / "evaluations.csv")
+    assert [row["kind"] for row in rows] == ["first", "first", "optimised"]
+    assert [float(rows[0][f"xi_{i}"]) for i in range(1, 5)] == [0.8, 1.2, 1, 1.5]

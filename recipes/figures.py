@@ -1,0 +1,116 @@
+"""The figures and the statistics of a study: ``python -m recipes.figures STUDY_FOLDER``.
+
+Everything is read from the study's folder, at any state of it, and written to its ``figures/``: each figure as PNG and
+PDF, the numbers that it shows as CSV, short tables as Markdown too, and ``README.md`` with all of them and captions.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import tyro
+
+from recipes.plots import cartpole, design_space, model_error, retrained, returns, statistics
+from recipes.plots.plot import Plot
+from recipes.reporting.page import FONT
+from recipes.reporting.records import number
+
+MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
+RESOLUTION = 150  # dots per inch of a PNG
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Figures:
+    """Draw what a study's folder holds."""
+
+    study: tyro.conf.Positional[Path]
+    """Folder of the study."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    asked = tyro.cli(Figures, prog="python -m recipes.figures", description=__doc__, args=arguments)
+    try:
+        for plot in write_figures(asked.study):
+            place = asked.study / "figures" / plot.name
+            print(f"{place}: {'nothing to draw. ' + plot.caption if plot.figure is None else 'written'}")
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+def write_figures(study: Path) -> list[Plot]:
+    """Write every figure that has something to show.
+
+    Args:
+        study: its folder.
+
+    Returns:
+        The plots, also those that have no figure because their input is not there.
+
+    Raises:
+        ValueError: if the folder is no study's.
+    """
+    folder, found = study / "figures", []
+    with mpl.rc_context(FONT):
+        for module in MODULES:
+            for plot in module.plots(study):
+                folder.mkdir(exist_ok=True)
+                write_plot(folder, plot)
+                found.append(plot)
+    (folder / "README.md").write_text(page(study, found), encoding="utf-8")
+    return found
+
+
+def write_plot(folder: Path, plot: Plot) -> None:
+    """The files of one plot; those of an earlier drawing that has nothing to show any more are removed."""
+    files = {suffix: folder / f"{plot.name}.{suffix}" for suffix in ("png", "pdf", "csv", "md")}
+    for path in files.values():
+        path.unlink(missing_ok=True)
+    if plot.figure is None:
+        return
+    plot.figure.savefig(files["png"], dpi=RESOLUTION)
+    plot.figure.savefig(files["pdf"], metadata={"CreationDate": None})
+    with files["csv"].open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(plot.rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: cell(value, digits=7) for key, value in row.items()} for row in plot.rows)
+    if plot.readable:
+        files["md"].write_text(f"{plot.caption}\n\n{table(plot.rows)}", encoding="utf-8")
+
+
+def page(study: Path, plots: Iterable[Plot]) -> str:
+    """All figures with their captions, in Markdown."""
+    lines = [f"# Figures of {study.resolve().name}", "", "Written by `python -m recipes.figures`.", ""]
+    for plot in plots:
+        lines += [f"## {plot.name}", ""]
+        if plot.figure is not None:
+            files = ", ".join(f"[{suffix}]({plot.name}.{suffix})" for suffix in ("pdf", "csv"))
+            lines += [f"![{plot.name}]({plot.name}.png)", "", f"{plot.caption} ({files})", ""]
+            lines += [table(plot.rows), ""] if plot.readable else []
+        else:
+            lines += [f"Not drawn. {plot.caption}", ""]
+    return "\n".join(lines)
+
+
+def table(rows: Sequence[Mapping[str, object]]) -> str:
+    """Rows as a Markdown table; numbers with three significant digits."""
+    head = list(rows[0])
+    lines = [head, ["---"] * len(head), *([str(cell(row[key], digits=3)) for key in head] for row in rows)]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def cell(value: object, *, digits: int) -> object:
+    """A number to so many significant digits; an empty cell for one that is not known."""
+    if isinstance(value, float):
+        return ("" if digits > 3 else "-") if math.isnan(value) else number(value, digits)
+    return value
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""What a run comes to in a few numbers, and how two arms differ in one of them."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from recipes.plots.intervals import holm, improvement, interval, mean
+from recipes.plots.runs import Run, Runs
+from recipes.reporting.figures import rank_correlation
+from recipes.reporting.records import Row
+
+Cells = dict[str, object]
+MEASURES = ("area", "final")
+# Against whom: everybody against the baseline; what imagines unseen bodies against what imagines seen ones; the
+# simulator that imagines random bodies against the model that does.
+BASELINES = {"none": None, "known": ("noisy", "random"), "random": ("oracle",)}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Numbers of one run.
+
+    Attributes:
+        run: whose they are.
+        area: under the best-return curve of Fig. 1, over the number of designs: the mean best return of a design.
+        final: the highest best return of all designs: what is in hand when the budget is spent.
+        correlation: Spearman's, of the prediction Q(xi) before a body was built and the best return on it.
+        bias: mean of prediction minus best return, both as reward per step; see `per_step`.
+        hours: wall-clock of the cell.
+        updates: of all learners and the ensemble.
+
+    All but the last two are NaN while they are not known; area and final while the run is under way.
+    """
+
+    run: Run
+    area: float
+    final: float
+    correlation: float
+    bias: float
+    hours: float
+    updates: int
+
+
+def measure(run: Run, failure: float) -> Measured:
+    """A diverged run counts with ``failure`` on each design that it did not reach."""
+    values = run.best_returns(failure) if run.over else np.array([math.nan])
+    pairs = predictions(run)
+    settings, rows = run.record.settings, [row for row in run.record.episodes if row["run"] == run.number]
+    an_episode = settings["individual_updates"] + settings["population_updates"]
+    learns_model = settings["designs"] != "none" and settings.get("dream") != "simulator"
+    an_episode += settings["model_updates"] * learns_model
+    correlation = rank_correlation(pairs)
+    return Measured(
+        run,
+        area=float(values.mean()),
+        final=float(values.max()),
+        correlation=math.nan if correlation is None else correlation,
+        bias=float(np.mean([row["predicted_per_step"] - row["return_per_step"] for row in pairs]))
+        if pairs
+        else math.nan,
+        hours=max(row["seconds"] for row in run.record.episodes) / 3600,
+        updates=len(rows) * an_episode,
+    )
+
+
+def predictions(run: Run) -> list[Row]:
+    """Designs with a prediction and a best return, both also as reward per step.
+
+    A constant reward r has the discounted value r / (1 - gamma) and, over T steps, the return r T. So (1 - gamma) Q and
+    return / T are both a mean reward per step, and agree if the reward is the same all the time. They are not the same
+    mean otherwise: Q weighs the first 1 / (1 - gamma) steps after a start, the return all T alike; Q is of the
+    population's policy before anything was learnt on the body, the return the best of the individual policy after it.
+    """
+    gamma, steps = run.record.settings["gamma"], run.record.settings["episode_steps"]
+    return [
+        row | {"predicted_per_step": (1 - gamma) * row["predicted"], "return_per_step": row["best_return"] / steps}
+        for row in run.designs
+        if math.isfinite(row["predicted"])
+    ]
+
+
+def pairs_of_arms(arms: Sequence[str]) -> list[tuple[str, str]]:
+    """Who is compared with whom, by `BASELINES`."""
+    return [
+        (arm, against)
+        for against, whom in BASELINES.items()
+        for arm in arms
+        if against in arms and arm != against and (whom is None or arm in whom)
+    ]
+
+
+def comparisons(runs: Runs, measured: Sequence[Measured]) -> list[Cells]:
+    """Every pair of arms by every measure, in each environment and task and, where there are several, over all.
+
+    Holm's correction is over all tests of one measure in the study.
+    """
+    rows = []
+    for name in MEASURES:
+        own = [row for arm, against in pairs_of_arms(runs.arms) for row in compare(runs, measured, name, arm, against)]
+        for test in ("welch_p", "paired_p"):
+            for row, corrected in zip(own, holm([float(str(row[test])) for row in own])):
+                row[f"{test}_holm"] = corrected
+        rows += own
+    return rows
+
+
+def compare(runs: Runs, measured: Sequence[Measured], name: str, arm: str, against: str) -> Iterator[Cells]:
+    """One pair of arms by one measure."""
+    strata: list[np.ndarray] = []
+    for place in runs.places:
+        mine, theirs = (values_of(measured, name, place, which) for which in (arm, against))
+        if not mine or not theirs:
+            continue
+        x, y = np.array(list(mine.values())), np.array(list(theirs.values()))
+        strata += [x, y]
+        shared = sorted(mine.keys() & theirs.keys())
+        difference = np.array([mine[key] - theirs[key] for key in shared])
+        yield (
+            {"environment": place[0], "task": place[1], "measure": name, "arm": arm, "against": against}
+            | {"runs": len(x), "runs_against": len(y), "difference": float(x.mean() - y.mean())}
+            | limits("difference", lambda x, y, axis: mean(x, axis) - mean(y, axis), x, y)
+            | {"improvement": float(improvement(x, y))}
+            | limits("improvement", improvement, x, y)
+            | {"welch_p": welch(x, y), "welch_p_holm": math.nan}
+            | {"pairs": len(shared), "paired_p": paired(difference), "paired_p_holm": math.nan}
+        )
+    if len(strata) > 2:
+        count, count_against = (sum(map(len, strata[side::2])) for side in (0, 1))
+        nothing = dict.fromkeys(("difference", "difference_low", "difference_high"), math.nan)  # scales differ
+        yield (
+            {"environment": "all", "task": "all", "measure": name, "arm": arm, "against": against}
+            | {"runs": count, "runs_against": count_against}
+            | nothing
+            | {"improvement": float(improvement(*strata))}
+            | limits("improvement", improvement, *strata)
+            | {"welch_p": math.nan, "welch_p_holm": math.nan}
+            | {"pairs": 0, "paired_p": math.nan, "paired_p_holm": math.nan}
+        )
+
+
+def values_of(
+    measured: Sequence[Measured], name: str, place: tuple[str, str], arm: str
+) -> dict[tuple[int, int], float]:
+    """A measure of the runs that are over, by seed and number: what pairs them with another arm's."""
+    own = [m for m in measured if ((m.run.environment, m.run.task), m.run.arm) == (place, arm) and m.run.over]
+    return {(m.run.seed, m.run.number): getattr(m, name) for m in own if math.isfinite(getattr(m, name))}
+
+
+def limits(name: str, statistic, *samples: np.ndarray) -> Cells:
+    """A bootstrap interval as two cells."""
+    low, high = interval(statistic, *samples)
+    return {f"{name}_low": float(low), f"{name}_high": float(high)}
+
+
+def welch(x: np.ndarray, y: np.ndarray) -> float:
+    """Two-sided p of Welch's t-test; NaN for less than two runs, or no spread at all."""
+    if min(len(x), len(y)) < 2 or np.ptp(x) == np.ptp(y) == 0:
+        return math.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # one arm without spread, such as all diverged, is no mistake
+        return float(stats.ttest_ind(x, y, equal_var=False).pvalue)
+
+
+def paired(difference: np.ndarray) -> float:
+    """Two-sided p of the paired t-test on the differences of runs that share seed and first designs.
+
+    Not Wilcoxon's: of five pairs its smallest two-sided p is 1/16, so that it could never find anything at 5 %.
+    """
+    if len(difference) < 2 or np.ptp(difference) == 0:
+        return math.nan
+    return float(stats.ttest_1samp(difference, 0.0).pvalue)

@@ -1,0 +1,129 @@
+"""Fig. 1 and Fig. 3: best return of each design over the order of building, every environment, task and arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from recipes.plots import arms as styles
+from recipes.plots.intervals import RESAMPLES, Statistic, iqm, mean, over_runs
+from recipes.plots.plot import Plot, missing
+from recipes.plots.runs import Place, Run, Runs, read_runs
+from recipes.reporting.palette import GREY, put_legend
+
+FIGURES = {
+    "figure_1_best_returns": ("none", "known"),
+    "figure_3_best_returns": ("none", "known", "noisy", "random"),
+}
+STATISTICS: dict[str, Statistic] = {"mean": mean, "IQM": iqm}
+PANEL = (3.6, 2.3)  # inches
+CAPTION = (
+    "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
+    "over the evaluation episodes on it. Faint: single runs. Strong: mean and interquartile mean (IQM) of those "
+    "that have reached the design. "
+    f"Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
+    "environment, task and arm). "
+)
+
+
+def plots(study: Path) -> Iterator[Plot]:
+    """Fig. 1, Fig. 3, and all arms together where there are others."""
+    runs = read_runs(study)
+    figures = dict(FIGURES)
+    others = [arm for arm in runs.arms if not any(arm in arms for arms in FIGURES.values())]
+    if others:
+        figures["best_returns_all_arms"] = tuple(runs.arms)
+    for name, arms in figures.items():
+        yield draw(name, runs, [arm for arm in arms if arm in runs.arms])
+
+
+def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
+    """One figure, a panel for each environment, task and statistic."""
+    drawn = [arm for arm in arms if any(run.designs for run in runs.found if run.arm == arm)]
+    if not drawn:
+        return missing(name, f"No run of {' or '.join(arms) or 'its arms'} has finished a design yet.")
+    panels = arranged(runs.places)
+    figure = Figure(figsize=(PANEL[0] * len(panels[0]), 0.6 + PANEL[1] * len(panels)), layout="constrained")
+    grid = figure.subplots(len(panels), len(panels[0]), squeeze=False, sharex="col")
+    rows: list[dict[str, object]] = []
+    first: dict[Place, Axes] = {}  # panels of one place share their limits
+    for axes, (place, label) in zip(grid.flat, (panel for line in panels for panel in line)):
+        if not draw_panel(axes, runs, place, drawn, label, rows):
+            axes.axis("off")
+        axes.sharey(first.setdefault(place, axes))
+    for axes in grid[-1]:
+        axes.set(xlabel="design (number)")
+    entries = styles.handles(drawn)
+    if any(run.diverged for run in runs.found if run.arm in drawn):
+        entries.append(Line2D([], [], marker="x", color=GREY, linestyle="", label="diverged after this design"))
+    put_legend(figure, entries)
+    return Plot(name=name, figure=figure, rows=rows, caption=CAPTION + runs.in_words(arms))
+
+
+def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:
+    """Lines of panels: environments side by side, mean above IQM; of one environment alone these two side by side."""
+    environments, tasks = (list(dict.fromkeys(part)) for part in zip(*places))
+    if len(environments) == 1:
+        return [[((environments[0], task), label) for label in STATISTICS] for task in tasks]
+    return [[((environment, task), label) for environment in environments] for task in tasks for label in STATISTICS]
+
+
+def draw_panel(
+    axes: Axes, runs: Runs, place: Place, arms: list[str], label: str, rows: list[dict[str, object]]
+) -> bool:
+    """Runs and one statistic of every arm; adds what it drew to the rows, and says whether there was anything."""
+    environment, task = place
+    failure = runs.failure(place)
+    for arm in arms:
+        own = [run for run in runs.of(place, arm) if run.designs or (run.diverged and math.isfinite(failure))]
+        if not own:
+            continue
+        longest = max(run.num_designs for run in own)
+        values = np.full((len(own), longest), math.nan)
+        for line, run in zip(values, own):
+            line[: run.num_designs] = run.best_returns(failure)
+            draw_run(axes, run)
+        value, low, high, count = over_runs(values, STATISTICS[label])
+        x, shown = np.arange(1, longest + 1), count > 0
+        axes.plot(x, value, linewidth=1.6, zorder=3, marker="o" if shown.sum() == 1 else "", **styles.style(arm))
+        axes.fill_between(x, low, high, color=styles.style(arm)["color"], alpha=0.1, linewidth=0, zorder=2)
+        for end in (low, high):
+            axes.plot(x, end, linewidth=0.5, zorder=2, **styles.style(arm))
+        head: dict[str, object] = {"environment": environment, "task": task, "arm": arm, "series": label}
+        for i in np.flatnonzero(shown):
+            numbers = {"best_return": value[i], "low": low[i], "high": high[i], "runs": int(count[i])}
+            rows.append(head | {"seed": "", "run": "", "design": int(x[i])} | numbers)
+        if label == "mean":  # the single runs are the same in both panels
+            rows += [row for run in own for row in rows_of(run)]
+    axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design, {label} (1)")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    return bool(axes.lines)
+
+
+def draw_run(axes: Axes, run: Run) -> None:
+    """A faint line through what the run reached, with a cross where it diverged."""
+    if not run.designs:
+        return
+    x, y = zip(*sorted((row["design"], row["best_return"]) for row in run.designs))
+    colour = styles.style(run.arm)["color"]
+    axes.plot(x, y, color=colour, linewidth=0.6, alpha=0.25, zorder=1)
+    if run.diverged:
+        axes.plot(x[-1:], y[-1:], color=colour, marker="x", linestyle="", zorder=4)
+
+
+def rows_of(run: Run) -> list[dict[str, object]]:
+    """The line of a single run."""
+    head = {"environment": run.environment, "task": run.task, "arm": run.arm, "series": "run"}
+    head |= {"seed": run.seed, "run": run.number}
+    last = {"low": "", "high": "", "runs": 1}
+    return [
+        head | {"design": row["design"], "best_return": row["best_return"]} | last
+        for row in sorted(run.designs, key=lambda row: row["design"])
+    ]

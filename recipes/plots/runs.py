@@ -1,0 +1,193 @@
+"""The runs of a study: which there are to be, how far each is, and what a diverged one counts.
+
+Shapes: M designs.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from recipes.plots.arms import in_order
+from recipes.reporting.records import Record, Row, read_record, read_rows
+
+Place = tuple[str, str]  # environment and task
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of one cell; a cell that advances several in lock-step has as many.
+
+    Attributes:
+        environment: name of the body.
+        task: forward or backward.
+        arm: what is compared.
+        seed: of the cell.
+        number: of the run within the cell, from 0.
+        record: the cell's folder, read back.
+        diverged: whether it broke down before it had tried all designs.
+    """
+
+    environment: str
+    task: str
+    arm: str
+    seed: int
+    number: int
+    record: Record
+    diverged: bool
+
+    @property
+    def num_designs(self) -> int:
+        """M, the designs it is to try."""
+        return self.record.settings["num_designs"]
+
+    @property
+    def designs(self) -> list[Row]:
+        """Designs that have a best return: all episodes done, or as far as a diverged run came."""
+        rows = [row for row in self.record.designs if row["run"] == self.number and math.isfinite(row["best_return"])]
+        return [row for row in rows if row["finished"] or self.diverged]
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more will come."""
+        return self.diverged or len(self.designs) == self.num_designs
+
+    @property
+    def state(self) -> str:
+        """In a word."""
+        return "diverged" if self.diverged else "finished" if self.over else "under way"
+
+    def best_returns(self, failure: float) -> np.ndarray:
+        """Best return of each design, ``[M]``; NaN where it is still to come.
+
+        A diverged run counts with ``failure`` on each design that it did not reach: left out, it would leave its arm
+        with the mean of those that held.
+        """
+        values = np.full(self.num_designs, failure if self.diverged else math.nan)
+        for row in self.designs:
+            values[row["design"] - 1] = row["best_return"]
+        return values
+
+
+@dataclass(frozen=True)
+class Runs:
+    """All runs of a study.
+
+    Attributes:
+        found: those that have begun.
+        planned: number of runs to come or there, by (environment, task, arm).
+    """
+
+    found: list[Run]
+    planned: Counter[tuple[str, str, str]]
+
+    @property
+    def places(self) -> list[Place]:
+        """Environments and tasks, as the ledger has them."""
+        return list(dict.fromkeys((environment, task) for environment, task, _ in self.planned))
+
+    @property
+    def arms(self) -> list[str]:
+        """All that are planned."""
+        return in_order(arm for _, _, arm in self.planned)
+
+    def arms_at(self, place: Place) -> list[str]:
+        """All that are planned in one environment and task."""
+        return [arm for arm in self.arms if self.planned[*place, arm]]
+
+    def of(self, place: Place, arm: str) -> list[Run]:
+        """Those of one environment, task and arm, by seed."""
+        runs = [run for run in self.found if (run.environment, run.task, run.arm) == (*place, arm)]
+        return sorted(runs, key=lambda run: (run.seed, run.number))
+
+    def failure(self, place: Place) -> float:
+        """What a design that a diverged run did not reach counts: the lowest best return of any design there.
+
+        So that no run is behind it, whatever the sign of the rewards; NaN where no design has a return yet.
+        """
+        own = [run for run in self.found if (run.environment, run.task) == place]
+        return min((row["best_return"] for run in own for row in run.designs), default=math.nan)
+
+    def in_words(self, arms: list[str]) -> str:
+        """How many of how many runs are over, and how many of them diverged, in a sentence."""
+        own = [run for run in self.found if run.arm in arms]
+        over, diverged = sum(run.over for run in own), sum(run.diverged for run in own)
+        planned = sum(count for (_, _, arm), count in self.planned.items() if arm in arms)
+        if over == planned:
+            words = f"All {planned} runs are over"
+        else:
+            words = f"{over} of {planned} runs are over, {len(own) - over} under way, {planned - len(own)} to come"
+        if not diverged:
+            return f"{words}; none diverged."
+        return (
+            f"{words}; {diverged} of them diverged and count, on each design that they did not reach, with the lowest "
+            "best return that any run of the environment and task has on a design."
+        )
+
+
+def read_runs(study: Path) -> Runs:
+    """Read a study's folder, in any state of it.
+
+    Raises:
+        ValueError: if it is none, or a cell's folder cannot be read.
+    """
+    cells = study / "cells"
+    if not cells.is_dir():
+        raise ValueError(f"{study} is no study's folder: it has no cells/; name a folder that recipes.study wrote")
+    names = cells_of_ledger(study / "ledger.csv")
+    names += sorted(path.name for path in cells.iterdir() if path.is_dir())
+    found: list[Run] = []
+    sizes: dict[tuple[str, str, str, int], int] = {}  # runs of each cell, 0 while it has not said so
+    for name in dict.fromkeys(names):
+        own = runs_of_cell(cells / name)
+        found += own
+        sizes[parts_of(name)] = own[0].record.settings["num_runs"] if own else 0
+    usual = max(sizes.values(), default=0) or 1
+    planned: Counter[tuple[str, str, str]] = Counter()
+    for (*which, _), size in sizes.items():
+        planned[tuple(which)] += size or usual
+    return Runs(found, planned)
+
+
+def cells_of_ledger(path: Path) -> list[str]:
+    """Names of all cells that are planned; none where there is no ledger."""
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return [row["cell"] for row in csv.DictReader(file)]
+
+
+def runs_of_cell(folder: Path) -> list[Run]:
+    """Those of one cell that have begun."""
+    environment, task, arm, seed = parts_of(folder.name)
+    return runs_of_folder(folder, environment, task, arm, seed)
+
+
+def runs_of_folder(folder: Path, environment: str, task: str, arm: str, seed: int) -> list[Run]:
+    """Those in an ordinary run folder that have begun."""
+    if not read_rows(folder / "evaluations.csv"):
+        return []
+    record = read_record(folder, folder.name)
+    said = [*record.episodes, *read_rows(folder / "designs.csv")]
+    diverged = {row["run"] for row in said if row.get("diverged")}
+    numbers = sorted({row["run"] for row in record.episodes})
+    return [Run(environment, task, arm, seed, number, record, number in diverged) for number in numbers]
+
+
+def parts_of(cell: str) -> tuple[str, str, str, int]:
+    """Environment, task, arm and seed of a cell's name; only an arm has hyphens of its own.
+
+    Raises:
+        ValueError: if the name has another form.
+    """
+    environment, _, rest = cell.partition("-")
+    task, _, rest = rest.partition("-")
+    arm, _, seed = rest.rpartition("-")
+    if not (environment and task and arm and seed.isdecimal()):
+        raise ValueError(f"cell {cell!r} is not named ENVIRONMENT-TASK-ARM-SEED, as hopper-forward-none-0")
+    return environment, task, arm, int(seed)

@@ -1,0 +1,201 @@
+"""Fig. 2: the best designs that each arm found, retrained from scratch: ``python -m recipes.retrain STUDY_FOLDER``.
+
+What an arm found are the designs that it chose by Eq. 5 (kind "optimised"), of all its seeds together: the first
+designs are given to every arm, and the random ones are nobody's merit. Its best half, by the best return in the study,
+is trained anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined.
+
+``retrained/designs.csv`` in the study's folder names what was chosen; what stands there is not chosen again when the
+study grows. Beside it are a ledger and ``cells/`` with an ordinary run folder for each. Run it again and it goes on:
+what is finished is skipped, what was stopped is resumed from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+import signal
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.machine import available_cores
+from recipes.plots.runs import Place, Run, Runs, read_runs
+from recipes.reporting.records import Row
+from recipes.results import write_whole
+from recipes.settings import saved_settings
+from recipes.studies.conduct import Conductor, Resources, ray_running
+from recipes.studies.definition import Cell
+from recipes.studies.ledger import Ledger
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retrain:
+    """Retrain the best designs of a study from scratch, with plain SAC."""
+
+    study: tyro.conf.Positional[Path]
+    """Folder of the study."""
+    arms: tuple[str, ...] = ("none", "known")
+    """Whose designs."""
+    top: float = 0.5
+    """Share of an arm's optimised designs, the best ones (Fig. 2: the top 50 %)."""
+    most: int = 18
+    """At most so many of each arm, environment and task (Fig. 2: 18 samples)."""
+    episodes: int | None = None
+    """Training episodes on each; by default as many as the study gave to a first design."""
+    workers: int = 0
+    """Designs at once on this machine, each on one core; 0 takes as many as there are cores."""
+    ray_address: str | None = None
+    """A Ray cluster, such as auto or 10.0.0.1:6379; by default this machine."""
+    gpus: float = 0.0
+    """Share of a GPU for each; above 0 its networks live there, wherever those of the study did."""
+
+
+@dataclass(frozen=True)
+class Retraining(Cell):
+    """A design that is trained from scratch.
+
+    Attributes:
+        folder: named after the cell, the run and the design that it comes from.
+    """
+
+    folder: str
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return self.folder
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line; ends with 1 if a design could not be trained."""
+    asked = tyro.cli(Retrain, prog="python -m recipes.retrain", description=__doc__, args=arguments)
+    try:
+        failed = retrain(asked)
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+    except KeyboardInterrupt as stop:
+        signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
+        print(f"\n{Stopped(signum)}; the same command goes on", file=sys.stderr)
+        sys.exit(128 + signum)
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}; see {asked.study}/retrained/ledger.csv")
+
+
+def retrain(asked: Retrain) -> list[str]:
+    """Choose, write down what was chosen, and train what is not trained yet.
+
+    Returns:
+        Names of what failed again and again.
+
+    Raises:
+        ValueError: if the share is not in (0, 1], a count is below 1, an arm is none of the study's, or no design was
+            found yet.
+    """
+    check(asked)
+    folder = asked.study / "retrained"
+    runs = read_runs(asked.study)
+    with locked(folder):
+        cells = [cell_of(line, asked) for line in choose(runs, folder / "designs.csv", asked)]
+        ledger = Ledger(folder / "ledger.csv", cells)
+        waiting = len(ledger.in_state("waiting"))
+        print(f"{waiting} of {len(cells)} designs to train -> {folder}")
+        if not waiting:
+            return []
+        workers = asked.workers or available_cores()
+        # Ray takes SIGTERM for itself when it starts.
+        with ray_running(address=asked.ray_address, workers=workers), stopping_at_once():
+            return Conductor(folder, cells, ledger, Resources(gpus=asked.gpus)).conduct()
+
+
+def check(asked: Retrain) -> None:
+    """Refuse what cannot be done."""
+    if not 0 < asked.top <= 1:
+        raise ValueError(f"--top is {asked.top}, a share of the designs lies in (0, 1]; Fig. 2 has 0.5")
+    for name, least in (("most", 1), ("episodes", 1), ("workers", 0), ("gpus", 0)):
+        if (value := getattr(asked, name)) is not None and value < least:
+            raise ValueError(f"--{name} is {value}, it must be at least {least}")
+
+
+def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
+    """Lines of ``designs.csv``: those that stand there, and those of arms that are asked for and have none there."""
+    lines = []
+    if path.is_file():
+        with path.open(newline="") as file:
+            lines = list(csv.DictReader(file))
+    there = {(line["environment"], line["task"], line["arm"]) for line in lines}
+    for arm in asked.arms:
+        if arm not in runs.arms:
+            raise ValueError(f"{arm!r} is no arm of {asked.study}; there are {', '.join(runs.arms)}")
+        for place in runs.places:
+            if (*place, arm) not in there:
+                lines += best_designs(runs, place, arm, asked)
+    if not lines:
+        raise ValueError(f"no run of {', '.join(asked.arms)} has an optimised design yet; let the study go on")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    write_whole(path, text.getvalue())
+    return lines
+
+
+def best_designs(runs: Runs, place: Place, arm: str, asked: Retrain) -> Iterator[dict[str, str]]:
+    """The best share of what an arm found in one environment and task, best first."""
+    found = [(run, row) for run in runs.of(place, arm) for row in run.designs if row["kind"] == "optimised"]
+    found.sort(key=lambda pair: -pair[1]["best_return"])
+    for run, row in found[: min(asked.most, math.ceil(asked.top * len(found)))]:
+        yield line_of(run, row)
+
+
+def line_of(run: Run, row: Row) -> dict[str, str]:
+    """A design and where it comes from."""
+    cell = run.record.name
+    return {
+        "folder": f"{cell}-run{run.number}-design{row['design']}",
+        "cell": cell,
+        "environment": run.environment,
+        "task": run.task,
+        "arm": run.arm,
+        "seed": str(run.seed),
+        "run": str(run.number),
+        "design": str(row["design"]),
+        "xi": " ".join(f"{value:.7g}" for value in row["xi"]),
+        "found_return": f"{row['best_return']:.7g}",
+    }
+
+
+def cell_of(line: dict[str, str], asked: Retrain) -> Retraining:
+    """Plain SAC on one body: the settings of the cell that found it, less population, imagination and search."""
+    settings = saved_settings(asked.study / "cells" / line["cell"])
+    settings = dataclasses.replace(
+        settings,
+        designs="none",
+        dream="ensemble",
+        bodies="search",
+        first_design=tuple(map(float, line["xi"].split())),
+        num_designs=1,
+        num_runs=1,
+        first_episodes=settings.first_episodes if asked.episodes is None else asked.episodes,
+        population_updates=0,
+        model_updates=0,
+        individual_mix=0.0,
+        individual_imagined_share=0.0,
+        seed=zlib.crc32(line["folder"].encode()),  # of its own, so that no two samples share initial weights
+        device="cpu",
+        resume=None,
+        name="retrained",
+        wandb="off",
+        quiet=True,
+    )
+    return Retraining(line["environment"], line["arm"], settings, 0, line["folder"])
+
+
+if __name__ == "__main__":
+    main()

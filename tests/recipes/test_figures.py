@@ -1,0 +1,158 @@
+"""The figures of a study: what is in their files, and what is said where something is not there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+
+from recipes.figures import main, write_figures
+from recipes.plots import returns, statistics
+from recipes.plots.plot import Plot
+from tests.recipes.made_up_study import read_table, write_cell, write_table
+
+DRAWN = ["figure_1_best_returns", "figure_3_best_returns", "statistics_arms", "statistics_pairs"]
+DRAWN += ["statistics_predictions", "statistics_runs"]
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Hopper, two arms with four and three runs, one of which diverged and one is under way."""
+    for seed, last in enumerate((1.0, 2.0, 4.0, 9.0)):
+        write_cell(tmp_path, f"hopper-forward-none-{seed}", [10, 20, 30, last], designs="none")
+    write_cell(tmp_path, "hopper-forward-known-0", [12, 22, 32, 42])
+    write_cell(tmp_path, "hopper-forward-known-1", [14, 24], diverged=[0])
+    write_cell(tmp_path, "hopper-forward-known-2", [10, 14, 40])
+    return tmp_path
+
+
+def test_every_figure_has_its_three_files_and_a_place_on_the_page(study: Path, capsys: pytest.CaptureFixture) -> None:
+    main([str(study)])
+    folder, said = study / "figures", capsys.readouterr().out
+    page = (folder / "README.md").read_text()
+    for name in DRAWN:
+        height, width, _ = imread(folder / f"{name}.png").shape
+        assert min(height, width) > 250
+        assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert read_table(folder / f"{name}.csv")
+        assert f"![{name}]({name}.png)" in page
+        assert f"{name}: written" in said
+    assert "6 of 7 runs are over, 1 under way, 0 to come; 1 of them diverged" in page
+    assert f"figure_2_retrained: nothing to draw. No design was retrained: python -m recipes.retrain {study}" in said
+    assert "Not drawn. No design was retrained" in page
+
+
+def test_the_csv_of_figure_1_holds_mean_iqm_interval_and_each_run(study: Path) -> None:
+    write_figures(study)
+    rows = read_table(study / "figures" / "figure_1_best_returns.csv")
+    value = {(row["arm"], row["series"], row["design"]): row for row in rows if row["series"] != "run"}
+    assert float(value["none", "mean", "4"]["best_return"]) == 4
+    assert float(value["none", "IQM", "4"]["best_return"]) == 3  # of 1, 2, 4, 9 the middle two
+    assert [value["none", "mean", "4"][end] for end in ("low", "high")] != ["", ""]
+    assert float(value["known", "mean", "2"]["best_return"]) == (22 + 24 + 14) / 3
+    assert value["known", "mean", "3"]["runs"] == "3"
+    assert float(value["known", "mean", "3"]["best_return"]) == pytest.approx((32 + 1 + 40) / 3)  # diverged counts as 1
+    assert value["known", "mean", "4"]["runs"] == "2"  # the run under way has no fourth design yet
+    single = [row for row in rows if (row["arm"], row["series"], row["seed"]) == ("known", "run", "1")]
+    assert [float(row["best_return"]) for row in single] == [14, 24]
+
+
+def test_the_table_of_arms_counts_planned_and_diverged_runs(study: Path) -> None:
+    names = [f"hopper-forward-{arm}-{seed}" for arm in ("none", "known") for seed in range(5)]
+    write_table(study / "ledger.csv", ["cell"], [[name] for name in names])
+    write_figures(study)
+    none, known = read_table(study / "figures" / "statistics_arms.csv")
+    assert [known[key] for key in ("arm", "planned", "over", "diverged", "diverged_share")] == [
+        "known", "5", "2", "1", "0.5",
+    ]  # fmt: skip
+    assert float(known["final_mean"]) == (42 + 24) / 2
+    assert float(known["area_mean"]) == pytest.approx((27 + (14 + 24 + 1 + 1) / 4) / 2)
+    assert (none["over"], float(none["final_iqm"])) == ("4", 30)
+    text = (study / "figures" / "statistics_arms.md").read_text()
+    assert "| hopper | forward | known | 5 | 2 | 1 | 0.5 |" in text
+    assert "nan" not in text
+    assert "6 of 10 runs are over, 1 under way, 3 to come" in text
+
+
+def test_figures_repeat_to_the_last_bit(study: Path) -> None:
+    write_figures(study)
+    first = {path.name: path.read_bytes() for path in (study / "figures").iterdir()}
+    write_figures(study)
+    assert first == {path.name: path.read_bytes() for path in (study / "figures").iterdir()}
+
+
+def test_other_arms_have_a_figure_with_all_of_them(study: Path) -> None:
+    write_cell(study, "hopper-forward-oracle-0", [1, 2, 3, 4])
+    write_figures(study)
+    arms = {
+        name: {row["arm"] for row in read_table(study / "figures" / f"{name}.csv")}
+        for name in ("figure_1_best_returns", "best_returns_all_arms")
+    }
+    assert arms == {"figure_1_best_returns": {"none", "known"}, "best_returns_all_arms": {"none", "known", "oracle"}}
+
+
+def test_several_environments_and_tasks_stand_in_one_figure(study: Path) -> None:
+    narrow = drawn(study)["figure_3_best_returns"]
+    for task in ("forward", "backward"):
+        for arm in ("none", "known"):
+            write_cell(study, f"half_cheetah-{task}-{arm}-0", [1, 2, 3, 4])
+            write_cell(study, f"walker-{task}-{arm}-0", [1, 2, 3, 4])
+    plots = drawn(study)
+    wide = plots["figure_3_best_returns"]
+    assert [len(plot.figure.axes) for plot in (narrow, wide) if plot.figure] == [2, 3 * 2 * 2]
+    assert len({(row["environment"], row["task"]) for row in wide.rows}) == 5
+    lone = [row["low"] for row in wide.rows if row["environment"] == "walker" and row["series"] != "run"]
+    assert all(math.isnan(float(str(low))) for low in lone)  # one run has no interval
+    assert [row["environment"] for row in plots["statistics_pairs"].rows].count("all") == 2
+
+
+def drawn(study: Path) -> dict[str, Plot]:
+    return {plot.name: plot for module in (returns, statistics) for plot in module.plots(study)}
+
+
+def test_a_study_that_has_just_begun_says_what_is_missing_and_keeps_no_old_figure(tmp_path: Path) -> None:
+    (tmp_path / "cells" / "hopper-forward-none-0").mkdir(parents=True)
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "statistics_arms.png").write_bytes(b"old")
+    found = write_figures(tmp_path)
+    assert all(plot.figure is None for plot in found)
+    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["README.md"]
+    assert "No run of none has finished a design yet." in (tmp_path / "figures" / "README.md").read_text()
+
+
+def test_a_study_of_which_every_run_diverged_at_once_is_told_not_drawn(tmp_path: Path) -> None:
+    folder = write_cell(tmp_path, "hopper-forward-none-0", [float("nan")], diverged=[0])
+    write_table(folder / "designs.csv", ["run"], [])
+    found = {plot.name: plot for plot in write_figures(tmp_path)}
+    assert found["statistics_arms"].figure is None
+    assert "1 of them diverged" in found["statistics_arms"].caption
+
+
+def test_a_folder_that_is_no_study_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="is no study's folder: it has no cells/"):
+        main([str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+
+
+RETRAINED = ["folder", "environment", "task", "arm", "seed", "run", "design", "xi", "found_return"]
+
+
+def test_figure_2_shows_the_best_return_of_each_retrained_design_and_welchs_test(study: Path) -> None:
+    best = {"none": [1, 2, 3], "known": [2, 4, 6, 8]}
+    lines = []
+    for arm, values in best.items():
+        for seed, value in enumerate(values):
+            name = f"hopper-forward-{arm}-{seed}-run0-design3"
+            lines.append([name, "hopper", "forward", arm, seed, 0, 3, "1 1", 30])
+            write_cell(study, name, [value], part="retrained/cells", num_designs=1)
+    lines.append(["not-yet", "hopper", "forward", "known", 9, 0, 3, "1 1", 30])
+    write_table(study / "retrained" / "designs.csv", RETRAINED, lines)
+    plot = next(plot for plot in write_figures(study) if plot.name == "figure_2_retrained")
+    rows = read_table(study / "figures" / "figure_2_retrained.csv")
+    for arm, values in best.items():
+        assert [float(row["best_return"]) for row in rows if row["arm"] == arm] == values
+    assert "7 of 8 designs are retrained, 0 of them diverged" in plot.caption
+    assert "known minus none 3 (95 % interval" in plot.caption
+    assert "Welch's t-test p = 0.1." in plot.caption  # t = 2.12 at 4.08 degrees of freedom

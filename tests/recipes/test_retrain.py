@@ -1,0 +1,116 @@
+"""Fig. 2's retraining: which designs, that it is plain SAC from scratch, and that it goes on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from coim import HopperMorph
+from recipes import experiment
+from recipes.figures import write_figures
+from recipes.plots.runs import read_runs
+from recipes.retrain import Retrain, best_designs, cell_of, choose, main
+from recipes.settings import Settings, parse, plain
+from tests.recipes.made_up_study import KINDS, read_table, write_cell
+from tests.recipes.test_experiment import TINY
+
+PLACE = ("hopper", "forward")
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """One optimised design each, with best returns 33, 31, ... 25 of "known" and 5, 6 of "none"."""
+    for seed, best in enumerate((31, 27, 33, 25, 29)):
+        write_cell(tmp_path, f"hopper-forward-known-{seed}", [90, 20, best, 80])
+    write_cell(tmp_path, "hopper-forward-none-0", [90, 20, 5, 80], [90, 20, 6, 80])
+    return tmp_path
+
+
+def test_the_best_half_is_of_the_designs_that_eq_5_chose_from_all_seeds_together(study: Path) -> None:
+    assert KINDS[2] == "optimised"
+    runs = read_runs(study)
+    found = list(best_designs(runs, PLACE, "known", Retrain(study=study)))
+    assert [line["found_return"] for line in found] == ["33", "31", "29"]  # half of five, rounded up
+    assert found[0]["folder"] == "hopper-forward-known-2-run0-design3"
+    assert found[0]["xi"] == "1 1"
+    assert [line["run"] for line in best_designs(runs, PLACE, "none", Retrain(study=study))] == ["1"]
+    most = Retrain(study=study, top=1.0, most=2)
+    assert [line["found_return"] for line in best_designs(runs, PLACE, "known", most)] == ["33", "31"]
+
+
+def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study: Path) -> None:
+    path = study / "chosen.csv"
+    first = choose(read_runs(study), path, Retrain(study=study, arms=("known",)))
+    write_cell(study, "hopper-forward-known-7", [90, 20, 99, 80])
+    both = choose(read_runs(study), path, Retrain(study=study))
+    assert both[:3] == first
+    assert [line["arm"] for line in both[3:]] == ["none"]
+    assert read_table(path) == both
+
+
+def settings_of(study: Path, cell: str, **values: object) -> Settings:
+    """Give a made-up cell every setting of a run."""
+    settings = parse("test", "", [*TINY, "--designs", "random", "--individual-imagined-share", "0.5", "--lr", "0.001"])
+    config = {"environment": "hopper", "settings": plain(settings) | values}
+    (study / "cells" / cell / "config.json").write_text(json.dumps(config))
+    return settings
+
+
+def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_one_body(study: Path) -> None:
+    cell = "hopper-forward-known-2"
+    settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
+    lines = list(best_designs(read_runs(study), PLACE, "known", Retrain(study=study)))
+    own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
+    assert (own.designs, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
+    assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
+    assert (own.first_design, own.first_episodes) == ((1, 1), 9)
+    assert (own.lr, own.batch_size, own.individual_updates) == (0.001, settings.batch_size, settings.individual_updates)
+    settings_of(study, "hopper-forward-known-0")
+    other = cell_of(lines[1], Retrain(study=study)).settings
+    assert own.seed != other.seed
+    assert other.first_episodes == settings.first_episodes
+
+
+def test_designs_are_retrained_once_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for arm in ("none", "known"):
+        folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
+        experiment.main(HopperMorph, "hopper", [*TINY, "--designs", arm, "--quiet", "--out", str(folder)])
+    main([str(tmp_path), "--episodes", "2", "--workers", "1"])
+    assert "2 of 2 designs to train" in capsys.readouterr().out
+    chosen = read_table(tmp_path / "retrained" / "designs.csv")
+    for line in chosen:
+        cell = tmp_path / "cells" / line["cell"]
+        found = next(row for row in read_table(cell / "designs.csv") if row["kind"] == "optimised")
+        retrained = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert [row["kind"] for row in retrained] == ["first", "first"]
+        assert [row["episode"] for row in retrained] == ["1", "2"]
+        assert all(row[f"xi_{i}"] == found[f"xi_{i}"] for row in retrained for i in range(1, 5))
+    main([str(tmp_path), "--episodes", "2", "--workers", "1"])
+    assert "0 of 2 designs to train" in capsys.readouterr().out
+    write_figures(tmp_path)
+    rows = read_table(tmp_path / "figures" / "figure_2_retrained.csv")
+    for row, line in zip(rows, chosen, strict=True):
+        own = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
+
+
+def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:
+    for options, words in (
+        (["--top", "0"], "--top is 0"),
+        (["--most", "0"], "--most is 0"),
+        (["--episodes", "0"], "--episodes is 0"),
+        (["--arms", "oracle"], "'oracle' is no arm of .*there are none, known"),
+    ):
+        with pytest.raises(SystemExit, match=words):
+            main([str(study), *options])
+    with pytest.raises(SystemExit, match="has no cells/"):
+        main([str(tmp_path / "nowhere")])
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_an_arm_that_chose_no_body_has_nothing_to_retrain(tmp_path: Path) -> None:
+    write_cell(tmp_path, "hopper-forward-none-0", [90, 20])
+    with pytest.raises(SystemExit, match="no run of none has an optimised design yet"):
+        main([str(tmp_path), "--arms", "none"])
