@@ -33,7 +33,7 @@ from coim import (
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
 from recipes.checkpoint import Checkpoints
-from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.interrupt import Stopped, locked, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.progress import Progress
 from recipes.report import write_report
@@ -91,7 +91,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
             print(f"\n{stop}; {again}", file=sys.stderr)
             sys.exit(128 + stop.signum)
         except OSError as error:  # a full disk, most likely
-            raise OSError(f"{error}; {again}") from error
+            first = f"make {folder} writable; " if says_read_only(error) else ""
+            raise OSError(f"{error}; {first}{again}") from error
     picture, report = draw_run(folder, body), write_report([folder], body=body)
     if not settings.quiet:
         print(f"picture: {picture}\nreport: {report}")
