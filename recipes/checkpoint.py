@@ -92,6 +92,9 @@ class Checkpoints:
             if complaint := self._complaint(path):
                 damaged.append((path, complaint))
                 continue
+            if damaged:  # those of an earlier time are of no use any more, and would be in the way
+                for old in self.folder.glob("damaged-*/"):
+                    shutil.rmtree(old, ignore_errors=True)
             for worse, why in damaged:
                 os.replace(worse, worse.with_name(f"damaged-{worse.name}"))
                 print(f"warning: {worse} is damaged ({why}); going on from {path.name}", file=sys.stderr)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torchrl.record.loggers.wandb import WandbLogger
 
 from coim import (
     Buffers,
@@ -18,7 +17,6 @@ from coim import (
     DesignChosen,
     DynamicsLearner,
     EpisodeDone,
-    Event,
     GaussianEnsemble,
     GradientSearch,
     KnownDesigns,
@@ -34,15 +32,15 @@ from coim import (
 )
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
-from coim.events import running
 from recipes.checkpoint import Checkpoints
-from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.interrupt import Stopped, locked, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
-from recipes.results import Results, default_folder, describe, refuse_filled, versions
+from recipes.results import Results, default_folder, refuse_filled, versions
 from recipes.settings import Settings, episodes_of, parse, read_config
+from recipes.wandb_log import WandbLog
 
 SIMULATED_ROWS = 250  # bodies that the simulator sets up and steps at once where it takes the ensemble's place
 
@@ -93,7 +91,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
             print(f"\n{stop}; {again}", file=sys.stderr)
             sys.exit(128 + stop.signum)
         except OSError as error:  # a full disk, most likely
-            raise OSError(f"{error}; {again}") from error
+            first = f"make {folder} writable; " if says_read_only(error) else ""
+            raise OSError(f"{error}; {first}{again}") from error
     picture, report = draw_run(folder, body), write_report([folder], body=body)
     if not settings.quiet:
         print(f"picture: {picture}\nreport: {report}")
@@ -117,18 +116,20 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         best=float("-inf") if trial is None else float(trial.best[trial.best.isfinite()].mean().nan_to_num(-torch.inf)),
         quiet=settings.quiet,
     )
-    logger = open_wandb(folder, name, settings)
+    log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb)
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)
         progress.show(event)
-        if logger is not None:
-            log(logger, event)
+        if log is not None:
+            log.write(event)
         # A chosen design is saved too: the swarm takes as long as an episode.
         chosen = isinstance(event, DesignChosen)
         if chosen or (isinstance(event, EpisodeDone) and (event.episode + 1) % settings.checkpoint_every == 0):
             checkpoints.save(results.notes())
     progress.end()
+    if log is not None:
+        log.close()
     if algorithm.divergence.everywhere:
         print("every run has diverged: there is nothing left to learn, and this ends here", file=sys.stderr)
     if not settings.quiet:
@@ -281,30 +282,3 @@ def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
         seed=seed,
         device=checked_device(settings.device),
     )
-
-
-def open_wandb(folder: Path, environment: str, settings: Settings) -> WandbLogger | None:
-    """W&B when asked for; offline needs no account and writes below the run's folder."""
-    if settings.wandb == "off":
-        return None
-    return WandbLogger(
-        exp_name=folder.name,
-        save_dir=str(folder),
-        offline=settings.wandb == "offline",
-        project=f"coim-{environment}",
-        config=describe(environment, settings),
-    )
-
-
-def log(logger: WandbLogger, event: Event) -> None:
-    """The numbers of the CSV files, one series for each run, over training steps."""
-    if not isinstance(event, EpisodeDone):
-        return
-    scalars = {f"seconds/{part}": value for part, value in event.seconds.items()}
-    for run in running(event):
-        scalars[f"run {run}/return"] = float(event.evaluation_return[run])
-        scalars[f"run {run}/training return"] = float(event.training_return[run])
-        scalars |= {f"run {run}/{key}": float(values[run]) for key, values in event.metrics.items()}
-        scalars |= {f"run {run}/xi_{i + 1}": float(xi) for i, xi in enumerate(event.design[run])}
-    for name, value in scalars.items():
-        logger.log_scalar(name, value, step=event.env_steps)

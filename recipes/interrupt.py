@@ -1,7 +1,8 @@
-"""Ctrl-C, SIGTERM, and two processes on one folder."""
+"""Ctrl-C, SIGTERM, two processes on one folder, and a folder that cannot be written to."""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 LOCK = ".lock"
+READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class Stopped(KeyboardInterrupt):
@@ -61,9 +63,17 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: if another process is at work in it.
+        OSError: if it cannot be made or written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK).open("a+") as file:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK).open("a+")
+    except OSError as error:
+        raise OSError(
+            f"{folder} cannot be written to ({error.strerror}); make it writable, or name another folder for a new run "
+            "with --out"
+        ) from error
+    with lock as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -74,3 +84,10 @@ def locked(folder: Path) -> Iterator[None]:
         file.write(f"process {os.getpid()} on {os.uname().nodename}")
         file.flush()
         yield
+
+
+def says_read_only(error: BaseException | None) -> bool:
+    """Whether an error, or what it came from, is that a folder may not be written to."""
+    while error is not None and getattr(error, "errno", None) not in READ_ONLY:
+        error = error.__cause__
+    return error is not None

@@ -8,6 +8,7 @@ import datetime
 import json
 import os
 import platform
+import secrets
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
@@ -234,6 +235,7 @@ def describe(environment: str, settings: Settings) -> dict[str, Any]:
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
         "revision": git_revision(),
         "started": now(),
+        "wandb_id": secrets.token_hex(4),  # one W&B run holds the whole curve, however often it is resumed
     }
 
 

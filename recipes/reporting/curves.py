@@ -100,6 +100,12 @@ def mark_kinds(axes: Axes, rows: Sequence[Row], column: str, colour: str | None 
                 axes.scatter(*zip(*points), s=size, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
 
 
+def _under_way(record: Record) -> bool:
+    """Whether there is a design that no run has finished."""
+    finished = {row["design"] for row in record.designs if row["finished"]}
+    return any(row["design"] not in finished for row in record.designs)
+
+
 def mark_divergences(axes: Axes, rows: Sequence[Row], x: str, y: str) -> None:
     """A cross where a run diverged."""
     axes.scatter([row[x] for row in rows], [row[y] for row in rows], s=45, color=BLACK, marker="x", zorder=5)
@@ -127,7 +133,7 @@ def explain(
     if kinds:
         there = [row["kind"] for record in records for row in record.designs]
         handles += kind_handles(there, GREY if several else None)
-        if any(not row["finished"] for record in records for row in record.designs):
+        if any(_under_way(record) for record in records):
             hollow = {"markerfacecolor": "white", "markeredgecolor": GREY}
             handles.append(Line2D([], [], marker="o", linestyle="", label="not finished", **hollow))
     if mean and not several and records[0].num_runs > 1:

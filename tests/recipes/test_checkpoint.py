@@ -129,6 +129,16 @@ def test_a_damaged_checkpoint_is_left_for_the_one_before_it(
     assert (folder / "checkpoint" / "damaged-checkpoint-000000000006").exists()
 
 
+def test_damaged_checkpoints_do_not_pile_up_and_are_not_in_the_way(tmp_path: Path) -> None:
+    folder = cut(tmp_path / "cut", 6) / "checkpoint"
+    for number in ("000000000004", "000000000006"):  # of earlier times; the sixth has been written anew since
+        (folder / f"damaged-checkpoint-{number}").mkdir()
+        (folder / f"damaged-checkpoint-{number}" / "manifest.json").write_bytes(b"")
+    (folder / "checkpoint-000000000006" / "manifest.json").write_bytes(b"")
+    resume(tmp_path / "cut")
+    assert [path.name for path in folder.glob("damaged-*")] == ["damaged-checkpoint-000000000006"]
+
+
 def test_without_a_whole_checkpoint_nothing_is_touched(tmp_path: Path) -> None:
     folder = cut(tmp_path / "cut", 6)
     (folder / "checkpoint" / "replay.bin").write_bytes(b"")
