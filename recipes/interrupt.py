@@ -36,8 +36,10 @@ def stopping_at_once() -> Iterator[None]:
 
     Nothing is saved on the way out: there is a checkpoint of every episode, and the rest of this one can take long.
     """
+    told: list[int] = []
 
     def stop(signum: int, frame: FrameType | None) -> None:
+        told.append(signum)
         for name in before:
             signal.signal(name, end)
         raise Stopped(signum)
@@ -48,6 +50,10 @@ def stopping_at_once() -> Iterator[None]:
     before = {signum: signal.signal(signum, stop) for signum in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
+    except (Exception, KeyboardInterrupt) as error:
+        if told and not isinstance(error, Stopped):  # compiled code and Ray raise an error of their own instead
+            raise Stopped(told[0]) from error
+        raise
     finally:
         stopped = signal.getsignal(signal.SIGINT) is end
         for signum, handler in before.items():

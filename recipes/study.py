@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,10 +63,9 @@ def main(options: Options) -> None:
                         raise ValueError(f"{lack} here; ask for less by --cpus and --gpus")
                     print(f"{lack}; waiting for one", flush=True)
                 failed = Conductor(folder, cells, ledger, resources).conduct()
-    except KeyboardInterrupt as stop:  # Stopped, unless Ray was the first to see it
-        signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
-        print(f"\n{Stopped(signum)}; to go on: {command(options)}", file=sys.stderr)
-        sys.exit(128 + signum)
+    except Stopped as stop:
+        print(f"\n{stop}; to go on: {command(options)}", file=sys.stderr)
+        sys.exit(128 + stop.signum)
     if failed:
         told = [f"  {name}: {ledger.entries[name].message[:300]}" for name in failed]
         again = f"to try them again: {command(options)}"

@@ -105,8 +105,8 @@ class Conductor:
             Names of those that failed again and again.
 
         Raises:
-            KeyboardInterrupt: when told to end. What was computed stays, and all processes that compute end at once:
-                checkpoints are made for that.
+            KeyboardInterrupt: when told to end (see `recipes.interrupt.stopping_at_once`). All processes that compute
+                end at once: checkpoints are made for that.
         """
         words = self.folder / "logs" / "ray.log"
         words.parent.mkdir(parents=True, exist_ok=True)
@@ -128,8 +128,7 @@ class Conductor:
     def _wait_for(self, running: dict[ray.ObjectRef, Cell]) -> None:
         try:
             while running:
-                time.sleep(POLL)  # not in ray.wait, which would turn every signal into Ctrl-C
-                done, _ = ray.wait(list(running), num_returns=len(running), timeout=0)
+                done, _ = ray.wait(list(running), timeout=POLL)
                 self._note_tries()
                 for reference in done:
                     self._note_end(running.pop(reference), reference)

@@ -7,6 +7,7 @@ import resource
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -155,3 +156,25 @@ def test_a_full_disk_is_one_sentence_and_the_last_checkpoint_is_good(whole: Path
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     resume(folder)
     assert soak.differences(whole, folder) == []
+
+
+@contextmanager
+def spoiling(error: BaseException) -> Iterator[None]:
+    """Raise something else in the place of what is raised within, as compiled code and Ray do."""
+    try:
+        yield
+    except Stopped:
+        raise error from None
+
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("error", [RuntimeError("Stopped: ..."), KeyboardInterrupt()])
+def test_a_stop_of_which_something_made_its_own_error_is_still_a_stop(error: BaseException) -> None:
+    with pytest.raises(Stopped) as stop, stopping_at_once(), spoiling(error):
+        signal.raise_signal(signal.SIGTERM)
+    assert stop.value.signum == signal.SIGTERM
+
+
+def test_errors_of_who_was_not_told_to_stop_stay_what_they_are() -> None:
+    with pytest.raises(RuntimeError, match="own"), stopping_at_once():
+        raise RuntimeError("own")
