@@ -1,13 +1,14 @@
 """Pictures of a body, without a screen.
 
 The bodies compile fast because they have no textures. A picture needs them, or nobody sees the ground pass by: sky and
-chequered floor are added to a copy here, which costs nothing beside drawing (about a tenth of a second without a
-graphics card).
+chequered floor are added to a copy here, which costs nothing beside drawing. Without a graphics card the first picture
+takes about a tenth of a second, most of it to set up OpenGL.
 """
 
 from __future__ import annotations
 
 import warnings
+from typing import Self
 
 import mujoco
 import numpy as np
@@ -18,38 +19,55 @@ MISSING_GL = (
 )
 
 
-def photograph(spec: mujoco.MjSpec, qpos: np.ndarray, *, width: int, height: int) -> np.ndarray:
-    """Draw a body from its right side, the camera moving along with it.
+class Camera:
+    """Draws one body from its right side, moving along with it; close it, or use it in a ``with`` block.
 
     Args:
         spec: the body; it is left as it is.
-        qpos: joint positions, ``[nq]``, the first being the distance travelled in m.
         width: pixels.
         height: pixels.
-
-    Returns:
-        The picture, ``[height, width, 3]`` uint8.
 
     Raises:
         RuntimeError: there is no OpenGL to draw with; the sentence says what to install and set.
     """
-    model = _dress(spec, width, height).compile()
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(model, camera)
-    camera.azimuth, camera.elevation = 90.0, -8.0
-    camera.lookat[0] = qpos[0]
-    try:
-        with warnings.catch_warnings():  # glfw warns about the missing screen before mujoco raises
-            warnings.simplefilter("ignore")
-            renderer = mujoco.Renderer(model, height, width)
-    except (mujoco.FatalError, ImportError, RuntimeError) as error:
-        raise RuntimeError(MISSING_GL) from error
-    with renderer:
-        renderer.update_scene(data, camera)
-        return renderer.render()
+
+    def __init__(self, spec: mujoco.MjSpec, *, width: int, height: int) -> None:
+        self._model = _dress(spec, width, height).compile()
+        self._data = mujoco.MjData(self._model)
+        self._view = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(self._model, self._view)
+        self._view.azimuth, self._view.elevation = 90.0, -8.0
+        try:
+            with warnings.catch_warnings():  # glfw warns about the missing screen before mujoco raises
+                warnings.simplefilter("ignore")
+                self._renderer = mujoco.Renderer(self._model, height, width)
+        except (mujoco.FatalError, ImportError, RuntimeError) as error:
+            raise RuntimeError(MISSING_GL) from error
+
+    def photograph(self, qpos: np.ndarray) -> np.ndarray:
+        """Draw the body in a pose.
+
+        Args:
+            qpos: joint positions, ``[nq]``, the first being the distance travelled in m.
+
+        Returns:
+            The picture, ``[height, width, 3]`` uint8.
+        """
+        self._data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, self._data)
+        self._view.lookat[0] = qpos[0]
+        self._renderer.update_scene(self._data, self._view)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free what the pictures were drawn with."""
+        self._renderer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
