@@ -13,6 +13,7 @@ from typing import Self
 import mujoco
 import numpy as np
 
+PERIOD = 2.0  # m, of the chequered floor: two squares of 1 m, which MuJoCo draws with texrepeat 1 (tried out)
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
@@ -54,8 +55,9 @@ class Camera:
             The picture, ``[height, width, 3]`` uint8.
         """
         self._data.qpos[:] = qpos
+        # The floor looks the same there, and who runs far leaves neither it nor the light.
+        self._data.qpos[0] = self._view.lookat[0] = qpos[0] % PERIOD
         mujoco.mj_forward(self._model, self._data)
-        self._view.lookat[0] = qpos[0]
         self._renderer.update_scene(self._data, self._view)
         return self._renderer.render()
 
@@ -93,7 +95,7 @@ def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
         width=128,
         height=128,
     )
-    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[0.5, 0.5])
+    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[2 / PERIOD, 2 / PERIOD])
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "chequers"
     spec.geom("floor").material = "floor"
     return spec
