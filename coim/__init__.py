@@ -24,12 +24,14 @@ from coim.episode import run_episode
 from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
 from coim.imagination import imagine
 from coim.learner import SACLearner
-from coim.models import GaussianEnsemble, Policy, QValue, StackedMLP, make_policy, make_qvalue, select_run
+from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, StackedMLP, make_policy, make_qvalue, select_run
 from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
+from coim.saved_run import Agent, SavedRun, TriedDesign, load_run
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Agent",
     "Buffers",
     "CoAdaptation",
     "CoImSACLoss",
@@ -48,18 +50,22 @@ __all__ = [
     "HopperMorph",
     "KnownDesigns",
     "MorphEnv",
+    "NetworkSizes",
     "NoisyDesigns",
     "ParticleSwarm",
     "Policy",
     "QValue",
     "RandomDesigns",
     "SACLearner",
+    "SavedRun",
     "SimulatorDynamics",
     "StackedMLP",
     "TransitionBuffer",
+    "TriedDesign",
     "WalkerMorph",
     "WorldModelEnv",
     "imagine",
+    "load_run",
     "make_policy",
     "make_qvalue",
     "run_episode",

@@ -1,8 +1,8 @@
 """Checkpoints of a run: written aside, synced, checksummed, renamed; the last two are kept.
 
 ``checkpoint/`` in a run's folder holds ``replay.bin``, to which the rows of each episode are appended, and for each
-checkpoint a folder of `torchrl.checkpoint` with everything else. TorchRL gives the format, the adapters and the
-rotation; the checksums, the syncing and the replay that is not written again each time are ours.
+checkpoint a folder of `torchrl.checkpoint` with everything else (`coim.checkpoints`). TorchRL gives the format, the
+adapters and the rotation; the checksums, the syncing and the replay that is not written again each time are ours.
 
 References:
     TorchRL: `torchrl.checkpoint <https://docs.pytorch.org/rl>`_.
@@ -10,7 +10,6 @@ References:
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -20,14 +19,24 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState, StateDictCheckpointAdapter
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
 from coim import CoAdaptation
+from coim.checkpoints import (
+    CHECKSUMS,
+    FORMAT,
+    PREFIX,
+    Held,
+    checksums,
+    files_complaint,
+    newest_whole,
+    read_notes,
+    state_parts,
+)
+from recipes.best_policies import BestPolicies
 from recipes.replay_file import ReplayFile
+from recipes.writing import sync
 
-FORMAT = 2  # of what is in a checkpoint; another one is refused
-CHECKSUMS = "sha256.json"
-PREFIX = "checkpoint"
 KEPT = 2
 
 
@@ -37,14 +46,15 @@ class Checkpoints:
     Args:
         folder: of the run.
         algorithm: whose episodes have ``episode_steps`` rows, and whose Replay_Pop holds all of them.
+        best: the best policies of the algorithm so far.
 
     Note:
         Replay_Ind (the last rows of Replay_Pop) and Replay_s0 (the first of each episode) are not written: they are
         read out of Replay_Pop again. Replay_Art is written.
     """
 
-    def __init__(self, folder: Path, algorithm: CoAdaptation) -> None:
-        self.folder, self.algorithm = folder / "checkpoint", algorithm
+    def __init__(self, folder: Path, algorithm: CoAdaptation, best: BestPolicies) -> None:
+        self.folder, self.algorithm, self.best = folder / "checkpoint", algorithm, best
         self._replay = ReplayFile(self.folder / "replay.bin")
         self._step = 0
 
@@ -63,7 +73,7 @@ class Checkpoints:
         try:
             self._replay.append({key: value[self._replay.num_rows :] for key, value in rows.items()})
             about = {"format": FORMAT, "replay": self._replay.description(), **notes}
-            parts(_Held(state), about).save(aside)
+            parts({"algorithm": Held(state), "best": self.best}, about).save(aside)
             seal(aside)
             os.replace(aside, self.folder / f"{PREFIX}-{self._step + 1:012d}")
             sync(self.folder)
@@ -84,79 +94,42 @@ class Checkpoints:
         Raises:
             ValueError: if there are checkpoints and none is whole, or it is one of another version or other sizes.
         """
-        found = sorted(self.folder.glob(f"{PREFIX}-*"), reverse=True)
         for path in self.folder.glob(".*/"):
             shutil.rmtree(path, ignore_errors=True)  # what a process that was killed had not finished
-        damaged = []
-        for path in found:
-            if complaint := self._complaint(path):
-                damaged.append((path, complaint))
-                continue
-            if damaged:  # those of an earlier time are of no use any more, and would be in the way
-                for old in self.folder.glob("damaged-*/"):
-                    shutil.rmtree(old, ignore_errors=True)
-            for worse, why in damaged:
-                os.replace(worse, worse.with_name(f"damaged-{worse.name}"))
-                print(f"warning: {worse} is damaged ({why}); going on from {path.name}", file=sys.stderr)
-            return self._read(path)
-        if damaged:
-            raise ValueError("no checkpoint is whole: " + "; ".join(f"{path} ({why})" for path, why in damaged))
-        return None
+        newest, damaged = newest_whole(self.folder, self._complaint)
+        if newest is None:
+            return None
+        if damaged:  # those of an earlier time are of no use any more, and would be in the way
+            for old in self.folder.glob("damaged-*/"):
+                shutil.rmtree(old, ignore_errors=True)
+        for worse, why in damaged.items():
+            os.replace(worse, worse.with_name(f"damaged-{worse.name}"))
+            print(f"warning: {worse} is damaged ({why}); going on from {newest.name}", file=sys.stderr)
+        return self._read(newest)
 
     def _complaint(self, path: Path) -> str | None:
-        """What is wrong with a checkpoint, or None."""
+        """What is wrong with a checkpoint or its part of the replay, or None."""
+        if complaint := files_complaint(path):
+            return complaint
         try:
-            expected = json.loads((path / CHECKSUMS).read_text())
-            actual = checksums(path)
-            wrong = sorted(name for name in expected.keys() | actual.keys() if expected.get(name) != actual.get(name))
-            if wrong:
-                return f"{', '.join(wrong)} not as written"
-            return self._replay.complaint(_notes(path)["replay"])
-        except (OSError, ValueError, KeyError) as error:
+            return self._replay.complaint(read_notes(path)["replay"])
+        except (OSError, KeyError) as error:
             return f"{type(error).__name__}: {error}"
 
     def _read(self, path: Path) -> dict[str, Any]:
-        notes = _notes(path)
-        if notes["format"] != FORMAT:
-            raise ValueError(
-                f"{path} has format {notes['format']}, this version writes {FORMAT}; go on with the version in "
-                "the run's config.json"
-            )
-        held = _Held({})
+        notes, held = read_notes(path), {"algorithm": Held(), "best": Held()}
         parts(held, {}).load(path)
         rows = self._replay.read(notes["replay"])
         steps = self.algorithm.env.episode_steps
-        self.algorithm.load_state_dict(with_replay(held.state, rows, steps))
+        self.algorithm.load_state_dict(with_replay(held["algorithm"].state, rows, steps))
+        self.best.load_state_dict(held["best"].state)
         self._step = int(path.name.removeprefix(f"{PREFIX}-"))
         return notes
 
 
-class _Held:
-    """A state between a file and an algorithm, so that nothing is changed before all of it is read."""
-
-    def __init__(self, state: dict[str, Any]) -> None:
-        self.state = state
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.state
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.state = state
-
-
-def parts(held: _Held, notes: dict[str, Any]) -> Checkpoint:
-    """What a checkpoint consists of, each with the adapter that writes it."""
-    checkpoint = Checkpoint(notes=notes)
-    # One file each: a file for every tensor, TorchRL's default, costs a sync for every tensor.
-    checkpoint.register("algorithm", held, adapter=StateDictCheckpointAdapter("torch"))
-    checkpoint.register("random", GlobalRNGState(), adapter=StateDictCheckpointAdapter("torch"))
-    return checkpoint
-
-
-def _notes(path: Path) -> dict[str, Any]:
-    notes: dict[str, Any] = {}
-    Checkpoint(notes=notes).load(path)
-    return notes
+def parts(states: Mapping[str, Any], notes: dict[str, Any]) -> Checkpoint:
+    """What a checkpoint consists of: states, and the generators that everybody shares."""
+    return state_parts({**states, "random": GlobalRNGState()}, notes)
 
 
 def without_replay(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -192,18 +165,3 @@ def seal(folder: Path) -> None:
     (folder / CHECKSUMS).write_text(json.dumps(checksums(folder), indent=2))
     for path in [*folder.rglob("*"), folder]:
         sync(path)
-
-
-def checksums(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file in a folder but the checksums themselves."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != CHECKSUMS)
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def sync(path: Path) -> None:
-    """Wait until a file's contents, or a folder's entries, are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

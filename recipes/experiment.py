@@ -17,21 +17,20 @@ from coim import (
     DesignChosen,
     DynamicsLearner,
     EpisodeDone,
-    GaussianEnsemble,
     GradientSearch,
     KnownDesigns,
     MorphEnv,
+    NetworkSizes,
     NoisyDesigns,
     ParticleSwarm,
     RandomDesigns,
     SACLearner,
     SimulatorDynamics,
     WorldModelEnv,
-    make_policy,
-    make_qvalue,
 )
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
+from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints
 from recipes.interrupt import Stopped, locked, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
@@ -101,7 +100,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
 
 def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings) -> None:
     """Iterate, from the start or from the last checkpoint: write, show and log each event, and save between them."""
-    checkpoints = Checkpoints(folder, algorithm)
+    best = BestPolicies(folder, algorithm)
+    checkpoints = Checkpoints(folder, algorithm, best)
     notes = checkpoints.load() if settings.resume is not None else None
     trial = algorithm.trial
     results = Results(folder, name, settings, algorithm.env.design_spec.shape[0], notes=notes)
@@ -120,6 +120,7 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)
+        best.follow(event)
         progress.show(event)
         if log is not None:
             log.write(event)
@@ -169,20 +170,18 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         )
 
     env, evaluation_env = bodies(), bodies()
-    stacked = settings.num_runs if settings.num_runs > 1 else None  # a single run needs no run axis in its networks
+    sizes = NetworkSizes.among(vars(settings))
 
     def learner() -> SACLearner:
         return SACLearner(
-            make_policy(env, num_cells=settings.num_cells, num_runs=stacked).to(device),
-            make_qvalue(env, num_critics=settings.num_critics, num_cells=settings.num_cells, num_runs=stacked).to(
-                device
-            ),
+            sizes.policy(env).to(device),
+            sizes.qvalue(env).to(device),
             alpha=settings.alpha,
             gamma=settings.gamma,
             tau=settings.tau,
             lr=settings.lr,
             mix=settings.mix,
-            num_runs=stacked,
+            num_runs=sizes.stacked,
             precision=settings.precision,
             compile=settings.compile,
             seed=next(seeds),
@@ -196,18 +195,12 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         truth = SimulatorDynamics(body(num_runs=SIMULATED_ROWS, seed=0, num_threads=threads, device=device))
         dream = WorldModelEnv(truth, env, batch_size=env.batch_size)
     elif generator is not None:
-        ensemble = GaussianEnsemble.for_env(
-            env,
-            num_members=settings.num_members,
-            num_cells=settings.model_cells,
-            predict=settings.predict,
-            num_runs=stacked,
-        ).to(device)
+        ensemble = sizes.ensemble(env).to(device)
         dynamics = DynamicsLearner(
             ensemble,
             lr=settings.model_lr,
             weight_decay=settings.weight_decay,
-            num_runs=stacked,
+            num_runs=sizes.stacked,
             precision=settings.precision,
             compile=settings.compile,
         )

@@ -16,13 +16,12 @@ from typing import Any
 import matplotlib as mpl
 import tyro
 
-from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
+from coim import MorphEnv
+from coim.envs import BODIES
 from recipes.reporting import diagnostics, figures
 from recipes.reporting.figures import Picture
 from recipes.reporting.page import FONT, image, note, page, section, table
 from recipes.reporting.records import Record, Row, number, read_records
-
-BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph, "walker": WalkerMorph}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -17,9 +17,9 @@ from typing import Any
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
-from recipes.checkpoint import sync
 from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
+from recipes.writing import write_whole
 
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
 
@@ -255,17 +255,6 @@ def refuse_filled(folder: Path) -> None:
             f"{folder} already holds something; name another folder with --out, move it away, or go on with the run in "
             f"it by --resume {folder}"
         )
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that it has either its old contents or the new ones, whatever happens."""
-    aside = path.with_name(f".{path.name}.new")
-    with aside.open("w", newline="") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
-    sync(path.parent)
 
 
 def now() -> str:

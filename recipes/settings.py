@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+
+from coim.saved_run import read_config
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -178,14 +179,6 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
 def plain(settings: Settings) -> dict[str, Any]:
     """Settings as JSON has them."""
     return {key: str(v) if isinstance(v, Path) else v for key, v in dataclasses.asdict(settings).items()}
-
-
-def read_config(folder: Path) -> dict[str, Any]:
-    """``config.json`` of a run's folder."""
-    try:
-        return json.loads((folder / "config.json").read_text())
-    except OSError as error:
-        raise ValueError(f"{folder} holds no run: {folder / 'config.json'} cannot be read ({error.strerror})") from None
 
 
 def saved_settings(folder: Path) -> Settings:

@@ -1,8 +1,8 @@
 """Is a run that was killed and resumed the run that was never killed?
 
 ``python -m recipes.soak --kills 50`` makes small runs in peace, and then fifty that are killed (SIGKILL) at random
-moments and resumed. It compares CSV files (but for the seconds), parameters, optimisers, generators and buffers, and
-says how many of the fifty were identical to the last bit.
+moments and resumed. It compares CSV files (but for the seconds), kept policies, parameters, optimisers, generators and
+buffers, and says how many of the fifty were identical to the last bit.
 """
 
 from __future__ import annotations
@@ -137,16 +137,20 @@ def finish(process: BaseProcess) -> None:
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """Where two run folders differ: rows of CSV files, seconds aside, and all that the last checkpoints hold."""
+    """Where two run folders differ: rows of CSV files but for the seconds, policies, what the last checkpoints hold."""
     found = []
     for name in ("evaluations.csv", "designs.csv", "metrics.csv"):
         rows = [rows_without_seconds(folder / name) for folder in (one, other)]
         found += [f"{name} row {i}" for i, (a, b) in enumerate(zip(*rows)) if a != b]
         if len(rows[0]) != len(rows[1]):
             found.append(f"{name}: {len(rows[0])} and {len(rows[1])} rows")
-    for name in ("algorithm", "random"):
-        states = [torch.load(last_state(folder, name), weights_only=True) for folder in (one, other)]
-        found += unequal(*states, path=name)
+    states = {name: [last_state(folder, name) for folder in (one, other)] for name in ("algorithm", "best", "random")}
+    policies = [{path.name for path in folder.glob("policies/*")} for folder in (one, other)]
+    if policies[0] != policies[1]:
+        found.append(f"policies: {sorted(policies[0] ^ policies[1])} are in one only")
+    states |= {name: [folder / "policies" / name for folder in (one, other)] for name in policies[0] & policies[1]}
+    for name, paths in states.items():
+        found += unequal(*(torch.load(path, weights_only=True) for path in paths), path=name)
     if (one / "checkpoint/replay.bin").read_bytes() != (other / "checkpoint/replay.bin").read_bytes():
         found.append("replay.bin")
     return found

@@ -19,10 +19,10 @@ ROOT = Path(__file__).parents[1]
 RANKS = {name: 0 for name in ("objectives.functional", "products", "angles", "compiling")}
 RANKS |= {name: 1 for name in ("envs", "models", "objectives", "designs", "buffers", "batches")}
 RANKS |= {name: 2 for name in ("learner", "dynamics_learner", "episode", "imagination", "events")}
-RANKS |= {name: 2 for name in ("continuation", "coadaptation", "divergence")}
+RANKS |= {name: 2 for name in ("continuation", "coadaptation", "divergence", "checkpoints", "saved_run")}
 RECIPES_ONLY = "recipes/"
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
-HOMES |= {name: RECIPES_ONLY for name in ("wandb", "tyro", "matplotlib", "argparse", "ray")}
+HOMES |= {name: RECIPES_ONLY for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray")}
 REFUSED = {"utils", "common", "core", "helpers", "misc", "trainers"}
 DYNAMIC_IMPORTS = {"importlib.import_module", "import_module", "__import__"}
 FUNCTIONAL_MAY_IMPORT = {"torch", "__future__", "typing", "math"}
@@ -100,7 +100,7 @@ def test_no_folder_or_module_has_a_name_that_says_nothing() -> None:
 def test_importing_the_library_is_silent_and_leaves_no_file(tmp_path: Path) -> None:
     modules = [module for _, module in library()]
     script = "\n".join(f"import {module}" for module in modules)
-    script += "\nimport sys; assert not {'matplotlib', 'wandb', 'tyro'} & set(sys.modules)"
+    script += "\nimport sys; assert not {'matplotlib', 'wandb', 'tyro', 'imageio'} & set(sys.modules)"
     script += "\nimport logging; assert not logging.root.handlers"
     result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")

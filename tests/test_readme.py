@@ -2,21 +2,42 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
 import pytest
 
+from coim import HopperMorph
+from recipes.experiment import run
+from recipes.settings import Settings
+
 README = Path(__file__).parents[1] / "README.md"
 SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
 
 
-def test_there_are_five_snippets() -> None:
-    assert len(SNIPPETS) == 5
+# Of the run whose folder a snippet opens.
+TINY = Settings(
+    num_designs=1,
+    first_episodes=1,
+    episode_steps=6,
+    individual_updates=1,
+    population_updates=1,
+    designs="none",
+    threads=1,
+    quiet=True,
+)
+
+
+def test_there_are_six_snippets() -> None:
+    assert len(SNIPPETS) == 6
 
 
 @pytest.mark.parametrize("snippet", SNIPPETS, ids=lambda text: text.splitlines()[-1][:40])
 def test_a_snippet_runs(snippet: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    for folder in re.findall(r'load_run\("(.*?)"\)', snippet):
+        run(HopperMorph, "hopper", dataclasses.replace(TINY, out=Path(folder)))
+    before = sorted(tmp_path.rglob("*"))
     exec(compile(snippet, "README.md", "exec"), {})
-    assert not list(tmp_path.iterdir()), "a snippet left files in the working directory"
+    assert sorted(tmp_path.rglob("*")) == before, "a snippet left files in the working directory"

@@ -17,4 +17,7 @@ from coim.envs.simulator_dream import SimulatorDynamics
 from coim.envs.walker import WalkerMorph
 from coim.envs.world_model import WorldModelEnv
 
-__all__ = ["HalfCheetahMorph", "HopperMorph", "MorphEnv", "SimulatorDynamics", "WalkerMorph", "WorldModelEnv"]
+# By the names of their recipes, which stand in a run's config.json.
+BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph, "walker": WalkerMorph}
+
+__all__ = ["BODIES", "HalfCheetahMorph", "HopperMorph", "MorphEnv", "SimulatorDynamics", "WalkerMorph", "WorldModelEnv"]

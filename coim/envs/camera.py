@@ -1,55 +1,75 @@
 """Pictures of a body, without a screen.
 
 The bodies compile fast because they have no textures. A picture needs them, or nobody sees the ground pass by: sky and
-chequered floor are added to a copy here, which costs nothing beside drawing (about a tenth of a second without a
-graphics card).
+chequered floor are added to a copy here, which costs nothing beside drawing. Without a graphics card the first picture
+takes about a tenth of a second, most of it to set up OpenGL.
 """
 
 from __future__ import annotations
 
 import warnings
+from typing import Self
 
 import mujoco
 import numpy as np
 
+PERIOD = 2.0  # m, of the chequered floor: two squares of 1 m, which MuJoCo draws with texrepeat 1 (tried out)
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
 )
 
 
-def photograph(spec: mujoco.MjSpec, qpos: np.ndarray, *, width: int, height: int) -> np.ndarray:
-    """Draw a body from its right side, the camera moving along with it.
+class Camera:
+    """Draws one body from its right side, moving along with it; close it, or use it in a ``with`` block.
 
     Args:
         spec: the body; it is left as it is.
-        qpos: joint positions, ``[nq]``, the first being the distance travelled in m.
         width: pixels.
         height: pixels.
-
-    Returns:
-        The picture, ``[height, width, 3]`` uint8.
 
     Raises:
         RuntimeError: there is no OpenGL to draw with; the sentence says what to install and set.
     """
-    model = _dress(spec, width, height).compile()
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(model, camera)
-    camera.azimuth, camera.elevation = 90.0, -8.0
-    camera.lookat[0] = qpos[0]
-    try:
-        with warnings.catch_warnings():  # glfw warns about the missing screen before mujoco raises
-            warnings.simplefilter("ignore")
-            renderer = mujoco.Renderer(model, height, width)
-    except (mujoco.FatalError, ImportError, RuntimeError) as error:
-        raise RuntimeError(MISSING_GL) from error
-    with renderer:
-        renderer.update_scene(data, camera)
-        return renderer.render()
+
+    def __init__(self, spec: mujoco.MjSpec, *, width: int, height: int) -> None:
+        self._model = _dress(spec, width, height).compile()
+        self._data = mujoco.MjData(self._model)
+        self._view = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(self._model, self._view)
+        self._view.azimuth, self._view.elevation = 90.0, -8.0
+        try:
+            with warnings.catch_warnings():  # glfw warns about the missing screen before mujoco raises
+                warnings.simplefilter("ignore")
+                self._renderer = mujoco.Renderer(self._model, height, width)
+        except (mujoco.FatalError, ImportError, RuntimeError) as error:
+            raise RuntimeError(MISSING_GL) from error
+
+    def photograph(self, qpos: np.ndarray) -> np.ndarray:
+        """Draw the body in a pose.
+
+        Args:
+            qpos: joint positions, ``[nq]``, the first being the distance travelled in m.
+
+        Returns:
+            The picture, ``[height, width, 3]`` uint8.
+        """
+        self._data.qpos[:] = qpos
+        # The floor looks the same there, and who runs far leaves neither it nor the light.
+        self._data.qpos[0] = self._view.lookat[0] = qpos[0] % PERIOD
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, self._view)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free what the pictures were drawn with."""
+        self._renderer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
@@ -75,7 +95,7 @@ def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
         width=128,
         height=128,
     )
-    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[0.5, 0.5])
+    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[2 / PERIOD, 2 / PERIOD])
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "chequers"
     spec.geom("floor").material = "floor"
     return spec

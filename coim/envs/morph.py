@@ -25,7 +25,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coim.envs.camera import photograph
+from coim.envs.camera import Camera
 from coim.envs.simulation import PITCH, ROOT_X, Simulations
 from coim.envs.task import Task, speed_along
 
@@ -269,9 +269,17 @@ class MorphEnv(EnvBase):
         Raises:
             RuntimeError: there is no OpenGL; the sentence says what to set and install.
         """
-        return photograph(
-            self.simulations.body(self._design[run].numpy()), self.simulations.qpos[run], width=width, height=height
-        )
+        with self.camera(run, width=width, height=height) as camera:
+            return camera.photograph(self.simulations.qpos[run])
+
+    def camera(self, run: int = 0, *, width: int = 480, height: int = 360) -> Camera:
+        """A camera for many pictures of one row's present body, from any ``simulations.qpos``; see :meth:`render`."""
+        return Camera(self.simulations.body(self._design[run].numpy()), width=width, height=height)
+
+    @property
+    def step_seconds(self) -> float:
+        """What a step takes in the simulated world, in s."""
+        return self.FRAME_SKIP * self.simulations.model(0).opt.timestep
 
     def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device

@@ -5,11 +5,13 @@ from .normaliser import RunningNormaliser
 from .policy import Policy, PolicyNetwork, make_policy
 from .qvalue import QValue, QValueNetwork, make_qvalue
 from .scaling import InputScaling
+from .sizes import NetworkSizes
 from .stacked import StackedLinear, StackedMLP, select_run
 
 __all__ = [
     "GaussianEnsemble",
     "InputScaling",
+    "NetworkSizes",
     "Policy",
     "PolicyNetwork",
     "QValue",

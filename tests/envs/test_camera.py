@@ -20,6 +20,13 @@ else:
     assert small.shape == tall.shape == (120, 160, 3) and small.dtype == np.uint8
     orange = [((p[..., 0] > 1.2 * p[..., 2]).any(1).nonzero()[0]) for p in (small, tall)]
     print("ROWS", *(len(rows) for rows in orange))
+    qpos = env.simulations.qpos[0].copy()
+    with env.camera(0, width=160, height=120) as camera:
+        places = (0.0, 0.5, 200.0, 1.99, 2.01)
+        pictures = [camera.photograph(qpos + [x, *[0] * (len(qpos) - 1)]).astype(int) for x in places]
+    here, half, far, before, after = pictures
+    assert (here == small).all()
+    print("CHANGE", *(int(np.abs(a - b).sum()) for a, b in ((here, half), (here, far), (before, after))))
 """
 
 
@@ -45,6 +52,9 @@ def test_a_picture_shows_the_body_of_the_row_or_says_what_is_missing():
     else:
         small, tall = int(said[1]), int(said[2])
         assert 2 * small < tall  # rows of the picture that the robot fills
+        half_a_metre, two_hundred, two_centimetres = (int(change) for change in said[4:])
+        assert two_hundred < half_a_metre / 20  # far away there is floor and light as at the start
+        assert two_centimetres < half_a_metre / 4  # and on the way there the floor never jumps
 
 
 def test_without_opengl_one_sentence_says_what_to_set_and_to_install():

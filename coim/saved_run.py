@@ -1,0 +1,276 @@
+"""A run's folder, opened for a script: the networks, the bodies they move, and the designs that were tried.
+
+Shapes: T steps, K runs, D design.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from coim.checkpoints import files_complaint, newest_whole, read_notes, read_state
+from coim.continuation import check_sizes
+from coim.envs import BODIES, MorphEnv
+from coim.episode import run_episode
+from coim.events import Kind
+from coim.learner import views
+from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, select_run
+
+NetworkT = TypeVar("NetworkT", bound=nn.Module)
+
+
+@dataclass(frozen=True, eq=False)
+class Agent:
+    """Networks that belong together.
+
+    Attributes:
+        policy: ``pi(a | s, xi)``.
+        qvalue: the critics ``Q(s, a, xi)``.
+    """
+
+    policy: Policy
+    qvalue: QValue
+
+
+@dataclass(frozen=True, eq=False)
+class TriedDesign:
+    """A row of ``designs.csv``.
+
+    Attributes:
+        run: in ``0 .. K - 1``.
+        number: 1 for the first, as in the files.
+        kind: one of the first designs, the optimum of Eq. 5, or a random one.
+        design: ``[D]``.
+        predicted: Eq. 5 before the body was built; NaN where there was no start state yet.
+        best_return: highest evaluation return.
+    """
+
+    run: int
+    number: int
+    kind: Kind
+    design: Tensor
+    predicted: float
+    best_return: float
+
+
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """What became of a run, as `load_run` returns it.
+
+    Attributes:
+        folder: of the run.
+        environment: name of the body.
+        settings: every setting, as ``config.json`` has it.
+        bodies: K of them, with the run's task and length of an episode, ready to be reset with designs.
+        population: pi_Pop and Q_Pop, which serve every design.
+        individual: pi_Ind and Q_Ind of the design that the run came to last, as they were at its checkpoint; see
+            `policy_of` for the others.
+        ensemble: p~; None in a run without one.
+        designs: those whose episodes are all over, a row per run and design.
+        run: the one that everything else is of; None where all K runs are stacked along the run axis.
+    """
+
+    folder: Path
+    environment: str
+    settings: dict[str, Any]
+    bodies: MorphEnv
+    population: Agent
+    individual: Agent
+    ensemble: GaussianEnsemble | None
+    designs: tuple[TriedDesign, ...]
+    run: int | None
+
+    def policy_of(self, number: int) -> Policy:
+        """The individual policy to which a design owes its best return.
+
+        Args:
+            number: of the design, from 1; each of K stacked runs has its own design of that number.
+
+        Raises:
+            ValueError: if there is none of this number; those that there are, are named.
+        """
+        weights = self._best(number)["policy"]
+        policy = NetworkSizes.among(self.settings | {"num_runs": self.bodies.numel()}).policy(self.bodies)
+        if policy.num_runs is None:
+            weights = {name: values[0] for name, values in weights.items()}
+        policy.network.mlp.load_state_dict(weights)
+        return policy.to(self.bodies.device)
+
+    def rewind(self, number: int) -> Tensor:
+        """Let the next reset of the bodies be the one before the best evaluation of a design.
+
+        Returns:
+            The design to reset them with, ``[K, D]``, to the last bit; `designs` has the seven digits of a CSV file.
+        """
+        best = self._best(number)
+        state = self.bodies.get_simulation_state()
+        state["generator"] = best["start"]
+        self.bodies.set_simulation_state(state)
+        return best["design"].to(self.bodies.device)
+
+    def best_episode(self, number: int) -> TensorDict:
+        """The evaluation that gave a design its best return, once more.
+
+        Args:
+            number: of the design, from 1.
+
+        Returns:
+            Rows ``[T, K]`` in the transition schema. Their return is the run's on the machine that made it; elsewhere,
+            or with one of K runs alone, products are rounded differently, which a gait may amplify.
+        """
+        design = self.rewind(number)
+        return run_episode(self.bodies, self.policy_of(number), design=design, deterministic=True)
+
+    def _best(self, number: int) -> dict[str, Any]:
+        """What the run kept of a design's best evaluation, the rows of this run or of all, ``[K, ...]`` each."""
+        path = policy_path(self.folder, number)
+        if not path.is_file():
+            there = sorted(int(path.stem.split("-")[1]) for path in path.parent.glob("design-*.pt"))
+            raise ValueError(
+                f"{self.folder} keeps no policy of design {number}: there are designs {there}, and "
+                "population.policy serves any"
+            )
+        kept = torch.load(path, map_location="cpu", weights_only=True)
+        return kept if self.run is None else _row(kept, self.run)
+
+
+def load_run(
+    folder: str | Path,
+    *,
+    run: int | None = None,
+    body: type[MorphEnv] | None = None,
+    device: torch.device | str = "cpu",
+) -> SavedRun:
+    """Open a run's folder, also while the run is still going on; nothing in it is changed.
+
+    Networks are those of the newest checkpoint that is whole. If that is not the newest one, a warning says so.
+
+    Args:
+        folder: that a recipe wrote.
+        run: one of K runs, which then has networks without a run axis and one body; None keeps all K.
+        body: the environment; by default the one that ``config.json`` names.
+        device: where the networks go, and the bodies' tensors.
+
+    Raises:
+        ValueError: if there is no run in the folder or no checkpoint of it yet, if all are damaged or of another
+            version, if there is no such run, or if the environment's name is not known.
+
+    Example:
+        >>> run = load_run("runs/hopper-20260101-120000-run")  # doctest: +SKIP
+        >>> best = max(run.designs, key=lambda design: design.best_return)  # doctest: +SKIP
+        >>> run_episode(run.bodies, run.policy_of(best.number), design=best.design[None])  # doctest: +SKIP
+    """
+    folder = Path(folder)
+    config = read_config(folder)
+    settings, environment = config["settings"], config["environment"]
+    body = body or BODIES.get(environment)
+    if body is None:
+        raise ValueError(f"{environment!r} is none of {', '.join(BODIES)}; give its class as body=")
+    try:
+        sizes = NetworkSizes.among(settings)
+        given = {"task": settings["task"], "episode_steps": settings["episode_steps"]}
+    except KeyError as error:
+        raise ValueError(f"{folder} has no setting {error}; load it with the version in its config.json") from None
+    if run is not None and not 0 <= run < sizes.num_runs:
+        raise ValueError(f"run {run} is not in {folder}, which has runs 0 .. {sizes.num_runs - 1}")
+    bodies = body(num_runs=sizes.num_runs if run is None else 1, seed=0, device=device, **given)
+
+    def ready(network: NetworkT) -> NetworkT:
+        alone = run is not None and sizes.stacked is not None
+        return (select_run(network, cast(int, run)) if alone else network).to(device)
+
+    def agent(state: dict[str, Any]) -> Agent:
+        policy, qvalue = sizes.policy(bodies), sizes.qvalue(bodies)
+        _fill([policy.network.mlp, qvalue.module.mlp], state["weights"])
+        return Agent(ready(policy), ready(qvalue))
+
+    state, ensemble = _last_state(folder), None
+    if state["dynamics"] is not None:
+        ensemble = sizes.ensemble(bodies)
+        _fill([ensemble.network], state["dynamics"]["weights"])
+        ensemble.inputs.load_state_dict(state["dynamics"]["inputs"])
+        ensemble.targets.load_state_dict(state["dynamics"]["targets"])
+    return SavedRun(
+        folder=folder,
+        environment=environment,
+        settings=settings,
+        bodies=bodies,
+        population=agent(state["population"]),
+        individual=agent(state["individual"]),
+        ensemble=None if ensemble is None else ready(ensemble),
+        designs=tuple(design for design in read_designs(folder) if run in (None, design.run)),
+        run=run,
+    )
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """``config.json`` of a run's folder."""
+    try:
+        config = json.loads((folder / "config.json").read_text())
+    except OSError as error:
+        raise ValueError(f"{folder} holds no run: {folder / 'config.json'} cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise ValueError(f"{folder / 'config.json'} is damaged ({error}); put it back from a copy") from None
+    if not isinstance(config, dict) or not {"environment", "settings"} <= config.keys():
+        raise ValueError(f"{folder} holds no run: its config.json names no environment and settings")
+    return config
+
+
+def read_designs(folder: Path) -> tuple[TriedDesign, ...]:
+    """Rows of ``designs.csv``; a last line that is still being written is left out."""
+    path = folder / "designs.csv"
+    if not path.is_file():
+        return ()
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
+    return tuple(
+        TriedDesign(
+            run=int(row["run"]),
+            number=int(row["design"]),
+            kind=cast(Kind, row["kind"]),
+            design=torch.tensor([float(cell) for name, cell in row.items() if name.startswith("xi_")]),
+            predicted=float(row["predicted"] or math.nan),
+            best_return=float(row["best_return"] or math.nan),
+        )
+        for row in rows
+    )
+
+
+def policy_path(folder: Path, number: int) -> Path:
+    """Where a run keeps the policy of a design, which counts from 1."""
+    return folder / "policies" / f"design-{number}.pt"
+
+
+def _last_state(folder: Path) -> dict[str, Any]:
+    """State of the algorithm in the newest checkpoint that is whole."""
+    path, damaged = newest_whole(folder / "checkpoint", files_complaint)
+    if path is None:
+        raise ValueError(f"{folder} has no checkpoint yet: its run writes the first one when it has chosen a design")
+    for worse, why in damaged.items():
+        warnings.warn(f"{worse} is damaged ({why}); reading {path.name}", stacklevel=3)
+    read_notes(path)
+    return read_state(path, "algorithm", device="cpu")
+
+
+@torch.no_grad()
+def _fill(networks: Iterable[nn.Module], flat: Tensor) -> None:
+    """Read networks out of a learner's flat buffer, in the order in which it laid them out."""
+    parameters = [parameter for network in networks for parameter in network.parameters()]
+    check_sizes({"weights": torch.cat([parameter.reshape(-1) for parameter in parameters])}, {"weights": flat})
+    for parameter, values in zip(parameters, views(flat, cast(Sequence[Tensor], parameters))):
+        parameter.copy_(values)
+
+
+def _row(state: dict[str, Any], run: int) -> dict[str, Any]:
+    """One row of every tensor, its axis kept."""
+    return {name: _row(v, run) if isinstance(v, dict) else v[run : run + 1] for name, v in state.items()}
