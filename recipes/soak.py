@@ -45,11 +45,13 @@ SMALL = Settings(
     threads=2,
     quiet=True,
 )
-# What a run can be made of: the paper's method, a fleet with noisy designs and mixed batches, and the baseline.
+# What a run can be made of: the paper's method, a fleet with noisy designs and mixed batches, the baseline, and the
+# paper's method with compiled gradients.
 KINDS = {
     "known designs": SMALL,
     "fleet": dataclasses.replace(SMALL, num_runs=3, designs="noisy", individual_mix=0.2, individual_imagined_share=0.2),
     "baseline": dataclasses.replace(SMALL, designs="none", search="gradient"),
+    "compiled": dataclasses.replace(SMALL, compile=True),
 }
 PLAIN = multiprocessing.get_context("forkserver")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -72,6 +74,19 @@ def test_a_run_killed_at_five_random_moments_is_the_run_that_was_left_alone(tmp_
     draw = Random(0)
     soak.killed_and_resumed(tmp_path / "killed", settings, *(draw.uniform(0.1, 0.6) * seconds for _ in range(5)))
     assert soak.differences(tmp_path / "whole", tmp_path / "killed") == []
+
+
+def test_a_compiled_run_that_was_killed_is_the_run_that_was_left_alone(tmp_path: Path) -> None:
+    settings, killed = soak.KINDS["compiled"], tmp_path / "killed"
+    soak.left_alone(tmp_path / "whole", settings)
+    process = soak.start(killed, settings)
+    while not list(killed.glob("checkpoint/checkpoint-*4")) and process.is_alive():
+        time.sleep(0.01)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    soak.finish(soak.start(killed, settings))
+    assert soak.differences(tmp_path / "whole", killed) == []
 
 
 def test_a_finished_run_can_be_resumed_and_given_more_designs(tmp_path: Path) -> None:

@@ -23,13 +23,13 @@ def test_every_kill_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setattr(soak, "left_alone", lambda folder, settings: 9.0)
     monkeypatch.setattr(soak, "killed_and_resumed", killed_and_resumed)
     monkeypatch.setattr(soak, "differences", lambda one, other: ["replay.bin"] if other.name == "2" else [])
-    soak.main(soak.Soak(kills=4, out=tmp_path / "soak.csv"))
+    soak.main(soak.Soak(kills=5, out=tmp_path / "soak.csv"))
     with (tmp_path / "soak.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["identical"] for row in rows] == ["True", "True", "False", "True"]
-    assert [row["kind"] for row in rows] == ["known designs", "fleet", "baseline", "known designs"]
+    assert [row["identical"] for row in rows] == ["True", "True", "False", "True", "True"]
+    assert [row["kind"] for row in rows] == ["known designs", "fleet", "baseline", "compiled", "known designs"]
     assert made == [*soak.KINDS.values(), soak.SMALL]
-    assert "3 of 4 identical" in capsys.readouterr().out
+    assert "4 of 5 identical" in capsys.readouterr().out
 
 
 def test_what_differs_is_named() -> None:
