@@ -1,7 +1,7 @@
 """One episode of a body under a policy, as rows of the transition schema.
 
-The loop works on bare tensors and makes one TensorDict at the end: TensorDict, specs and distribution objects cost
-about ten times the physics per step.
+The loop writes bare tensors into rows that are there already; rewards and one TensorDict are made of all of them at the
+end. TensorDict, specs and distribution objects cost about ten times the physics per step.
 
 Shapes: T steps, K runs, S observation, D design, A action.
 """
@@ -56,23 +56,25 @@ def run_episode(
     observations = observation.new_empty(steps, *observation.shape)
     following = torch.empty_like(observations)
     actions = observation.new_empty(steps, *shape)
-    rewards = observation.new_empty(steps, *env.batch_size, 1)
     broken = torch.zeros(steps, *env.batch_size, 1, dtype=torch.bool, device=observation.device)
     network = None if policy is None else policy.network.for_design(design)
-    for t in range(steps):
+    rows = zip(observations.unbind(), actions.unbind(), following.unbind(), broken.unbind())
+    for t, (observed, acted, followed, ended) in enumerate(rows):
+        observed.copy_(observation)
         if network is None:
-            action = noise[t]
+            acted.copy_(noise[t])
         else:
             loc, scale = network(observation)
-            action = (loc if deterministic else torch.addcmul(loc, scale, noise[t])).tanh_()
-        observations[t], actions[t] = observation, action
-        observation, rewards[t], broken[t] = env.advance(action)
-        following[t] = observation
-        if broken[t].any():
-            observation = env.reset(TensorDict({"_reset": broken[t]}, env.batch_size))["observation"]
+            torch.tanh(loc if deterministic else torch.addcmul(loc, scale, noise[t]), out=acted)
+        observation, terminated = env.move(acted)
+        followed.copy_(observation)
+        if terminated.any():
+            ended.copy_(terminated)
+            observation = env.reset(TensorDict({"_reset": terminated}, env.batch_size))["observation"]
+    designs = design.expand(steps, *design.shape)
+    rewards = env.reward(observations, actions, following, designs, env.task)
     truncated = torch.zeros_like(broken)
     truncated[-1] = True
-    designs = design.expand(steps, *design.shape)
     return TensorDict(
         {
             "observation": observations,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -49,11 +50,11 @@ def test_a_broken_row_is_terminated_and_starts_again_while_the_other_goes_on() -
 
         steps = 0
 
-        def advance(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        def move(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             if self.steps == 2:
                 self.simulations.qvel[0] = 1e12
             self.steps += 1
-            return super().advance(action)
+            return super().move(action)
 
     breaking, whole = (body(num_runs=2, episode_steps=6, seed=0) for body in (Breaking, HopperMorph))
     rows, expected = (run_episode(env, None, rng=torch.Generator().manual_seed(0)) for env in (breaking, whole))
@@ -74,3 +75,12 @@ def test_a_sampled_action_is_the_tanh_of_loc_plus_scale_times_the_noise_of_the_g
     with torch.no_grad():
         loc, scale = policy.network(rows["observation"], rows["design"])
     torch.testing.assert_close(rows["action"], (loc + scale * noise).tanh(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["forward", "backward"])
+def test_the_rewards_of_an_episode_are_those_of_its_steps_to_the_last_bit(task: str) -> None:
+    rows = run_episode(HopperMorph(num_runs=3, task=task, episode_steps=40, seed=0), None)
+    env = HopperMorph(num_runs=3, task=task, episode_steps=40, seed=0)
+    env.reset()
+    rewards = torch.stack([env.advance(action)[1] for action in rows["action"]])
+    assert torch.equal(rows["next", "reward"], rewards)

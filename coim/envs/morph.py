@@ -176,6 +176,23 @@ class MorphEnv(EnvBase):
         Raises:
             ValueError: the action has another shape or a number that is not finite; nothing has moved then.
         """
+        before = self._observation
+        observation, terminated = self.move(action)
+        reward = self.reward(before, action.detach().cpu(), self._observation, self._design, self.task)
+        return observation, self._send(reward), terminated
+
+    def move(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`advance` without the reward, which :meth:`reward` gives for a whole episode at once.
+
+        Args:
+            action: ``[K, A]``.
+
+        Returns:
+            Next observation ``[K, S]`` and whether the simulation broke ``[K, 1]``.
+
+        Raises:
+            ValueError: as :meth:`advance`.
+        """
         action = action.detach().cpu()
         if action.shape != self.simulations.ctrl.shape:
             raise ValueError(f"action has shape {list(action.shape)}, the fleet takes {list(self.action_spec.shape)}")
@@ -190,10 +207,9 @@ class MorphEnv(EnvBase):
             observation[broken] = self._observation[broken]
             terminated[broken] = True
             self.num_broken[broken] += 1
-        reward = self.reward(self._observation, action, observation, self._design, self.task)
         self._observation = observation.clone()  # ours; what is handed out may be written to
         self._step_count += 1
-        return self._send(observation), self._send(reward), self._send(terminated)
+        return self._send(observation), self._send(terminated)
 
     def place(self, observation: Tensor, design: Tensor) -> None:
         """Set all simulations to a state and a body each, to compare a learnt model with the truth.

@@ -68,7 +68,7 @@ class SimulatorDynamics:
             part = slice(start, start + rows)
             here, torques, body = (_filled_up(value[part], rows) for value in asked)
             self.bodies.place(here, body)
-            found = self.bodies.advance(torques)[0]
+            found = self.bodies.move(torques)[0]
             after[part] = found[: len(after[part])]
         return after.reshape(observation.shape)
 

@@ -137,16 +137,16 @@ def test_an_ensemble_that_diverges_ends_its_run_too(tmp_path: Path, monkeypatch:
 def test_a_simulation_that_breaks_is_told_and_the_run_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    advance, steps = HopperMorph.advance, 0
+    move, steps = HopperMorph.move, 0
 
-    def advance_and_break(env: HopperMorph, action: torch.Tensor) -> Any:
+    def move_and_break(env: HopperMorph, action: torch.Tensor) -> Any:
         nonlocal steps
         steps += 1
         if steps == 15:  # the second training episode is the steps 13 to 18
             env.simulations.qvel[1] = 1e30
-        return advance(env, action)
+        return move(env, action)
 
-    monkeypatch.setattr(HopperMorph, "advance", advance_and_break)
+    monkeypatch.setattr(HopperMorph, "move", move_and_break)
     folder = run_tiny(tmp_path / "run", **FLEET)
     shown = capsys.readouterr().err
     assert shown == (
