@@ -35,12 +35,14 @@ PAPER = PRESETS["paper"]
 Protocol = Literal["paper", "preview", "smoke"]
 PROTOCOLS: dict[str, Settings] = {
     "paper": PAPER,
-    # About nine hours of one core, five of two, for the study of this name with its 26 runs. The first designs stay
-    # five, as they are the paper's; ten more let five be optimised; and eight episodes each are 8,000 updates of a
-    # controller that starts from the population's. Few episodes at the start would leave Eq. 5 to critics that know
-    # little, so all designs get the same. The gradient search finds what the swarm finds (Q of 1.00 - 1.01 of the
-    # swarm's) in 7 % of its time. bfloat16 would allow half as many episodes again, but is not shown to cost nothing.
-    "preview": dataclasses.replace(PAPER, num_designs=15, first_episodes=8, episodes=8, search="gradient"),
+    # About eight hours of one core, four of two, for the study of this name with its 26 runs: on the machine of
+    # docs/results an episode takes 8 s without and 12.5 s with imagination, a seventh more when both cores are busy.
+    # The first designs stay five, as they are the paper's; ten more let five be optimised; and six episodes each are
+    # 6,000 updates of a controller that starts from the population's. Few episodes at the start would leave Eq. 5 to
+    # critics that know little, so all designs get the same. The gradient search finds what the swarm finds (Q of
+    # 1.00 - 1.01 of the swarm's) in 7 % of its time. bfloat16 would allow a third more episodes, but is not shown to
+    # cost nothing.
+    "preview": dataclasses.replace(PAPER, num_designs=15, first_episodes=6, episodes=6, search="gradient"),
     "smoke": Settings(
         num_designs=6,
         first_episodes=1,
