@@ -1,4 +1,4 @@
-# `make run` and `make test` do everything from a bare clone: Python >= 3.11, make and a C compiler are all they need.
+# `make run` and `make test` do everything from a bare clone: Python >= 3.11, make and a C++ compiler are all they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
