@@ -161,7 +161,7 @@ def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | temporary,
+        env=os.environ | temporary | {"RAY_worker_niceness": "0"},
     )
 
     def refuse_another_and_stop(pid: int) -> None:
