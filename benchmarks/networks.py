@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from coim import HalfCheetahMorph, HopperMorph, MorphEnv, Policy, QValue, make_policy, make_qvalue
+from coim import MorphEnv, Policy, QValue, make_policy, make_qvalue
+from coim.envs import BODIES
 
-BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph}
+TRAINED = ("half_cheetah", "hopper")
 FOLDER = Path(__file__).parent / "data"
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import tyro
 
-from benchmarks.networks import BODIES, FOLDER, save
+from benchmarks.networks import FOLDER, TRAINED, save
 from coim import EpisodeDone
+from coim.envs import BODIES
 from recipes.experiment import build
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.settings import Settings
@@ -22,7 +23,7 @@ from recipes.settings import Settings
 class Training:
     """Which networks, and for how long."""
 
-    bodies: tuple[str, ...] = tuple(BODIES)
+    bodies: tuple[str, ...] = TRAINED
     """One file for each of them."""
     num_designs: int = 25
     """Bodies tried; after the first five, optimised and random ones in turn."""

@@ -213,6 +213,12 @@ class CoAdaptation:
         """Go on as the one that :meth:`state_dict` was read from; see `coim.continuation.restore`."""
         restore(self, state_dict)
 
+    @property
+    def updates_per_episode(self) -> int:
+        """Of both learners and the ensemble together."""
+        model = 0 if self.dynamics is None else self.model_updates
+        return self.individual_updates + self.population_updates + model
+
     def _episodes_of(self, index: int) -> int:
         return self.first_episodes if index < len(self.first_designs) else self.episodes
 

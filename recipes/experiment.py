@@ -108,9 +108,7 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
     progress = Progress(
         num_designs=settings.num_designs,
         total_episodes=sum(episodes_of(settings, index) for index in range(settings.num_designs)),
-        updates=settings.individual_updates
-        + settings.population_updates
-        + settings.model_updates * (algorithm.dynamics is not None),
+        updates=algorithm.updates_per_episode,
         imagined_share=algorithm.population_parts.imagined / settings.batch_size,
         done=algorithm.env_steps // settings.episode_steps,
         best=float("-inf") if trial is None else float(trial.best[trial.best.isfinite()].mean().nan_to_num(-torch.inf)),

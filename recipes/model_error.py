@@ -15,7 +15,8 @@ from pathlib import Path
 
 import torch
 
-from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph, select_run
+from coim import MorphEnv, select_run
+from coim.envs import BODIES
 from recipes.experiment import build, check_origin, follow
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
@@ -28,11 +29,6 @@ from recipes.reporting.pictures import draw_run
 from recipes.results import default_folder, refuse_filled, write_whole
 from recipes.settings import Settings, parse
 
-BODIES: dict[str, type[MorphEnv]] = {
-    "half_cheetah": HalfCheetahMorph,
-    "hopper": HopperMorph,
-    "walker": WalkerMorph,
-}
 STATES = 3  # of which Fig. 4(b) is drawn, at random
 
 
@@ -143,16 +139,23 @@ def probe(
 
 
 def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder: Path) -> str:
-    """Fig. 4(b)'s numbers of the first run, from its models as they are at the end; returns what happened in words."""
+    """Fig. 4(b)'s numbers from the models as they are at the end; returns what happened in words.
+
+    They are of the first run that has not diverged.
+    """
     if not probed.seen:
         return f"no {FILE}: the run ended before its first measurement"
-    seen = joined(probed.seen)[:, 0]
-    tried = torch.stack([rows["design"][0, 0] for rows in probed.seen])
+    learning = [run for run in range(probed.env.numel()) if run not in probed.divergence.places]
+    if not learning:
+        return f"no {FILE}: the run diverged, and its model stands still since"
+    run = learning[0]
+    seen = joined(probed.seen)[:, run]
+    tried = torch.stack([rows["design"][0, run] for rows in probed.seen])
     chosen = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))[:STATES]
     models, variance = {}, change_variance(probed.learners["delta"])  # the run axis is dropped from both
     for predict, learner in sorted(probed.learners.items()):
-        models[predict] = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, 0)
-    variance = variance if variance.ndim == 1 else variance[0]
+        models[predict] = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, run)
+    variance = variance if variance.ndim == 1 else variance[run]
     simulator, bounds = probed.probes.simulator, body.DESIGN_BOUNDS
     try:
         rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)

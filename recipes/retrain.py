@@ -5,8 +5,9 @@ designs are given to every arm, and the random ones are nobody's merit. Its best
 is trained anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined.
 
 ``retrained/designs.csv`` in the study's folder names what was chosen; what stands there is not chosen again when the
-study grows. Beside it are a ledger and ``cells/`` with an ordinary run folder for each. Run it again and it goes on:
-what is finished is skipped, what was stopped is resumed from its checkpoint.
+study grows, and says how many of the arm's runs were over by then. Beside it are a ledger and ``cells/`` with an
+ordinary run folder for each. Run it again and it goes on: what is finished is skipped, what was stopped is resumed from
+its checkpoint.
 """
 
 from __future__ import annotations
@@ -30,9 +31,8 @@ from recipes.plots.runs import Place, Run, Runs, read_runs
 from recipes.reporting.records import Row
 from recipes.results import write_whole
 from recipes.settings import saved_settings
-from recipes.studies.conduct import Conductor, Resources, ray_running
+from recipes.studies.conduct import Conductor, Resources, ray_running, refuse_lack, take_up
 from recipes.studies.definition import Cell
-from recipes.studies.ledger import Ledger
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,15 +95,15 @@ def retrain(asked: Retrain) -> list[str]:
         Names of what failed again and again.
 
     Raises:
-        ValueError: if the share is not in (0, 1], a count is below 1, an arm is none of the study's, or no design was
-            found yet.
+        ValueError: if the share is not in (0, 1], a count is below 1, an arm is none of the study's, no design was
+            found yet, what is retrained already was retrained otherwise, or a GPU is asked for and none is here.
     """
     check(asked)
     folder = asked.study / "retrained"
     runs = read_runs(asked.study)
     with locked(folder):
         cells = [cell_of(line, asked) for line in choose(runs, folder / "designs.csv", asked)]
-        ledger = Ledger(folder / "ledger.csv", cells)
+        ledger = take_up(folder, cells)
         waiting = len(ledger.in_state("waiting"))
         print(f"{waiting} of {len(cells)} designs to train -> {folder}")
         if not waiting:
@@ -111,7 +111,9 @@ def retrain(asked: Retrain) -> list[str]:
         workers = asked.workers or available_cores()
         # Ray takes SIGTERM for itself when it starts.
         with ray_running(address=asked.ray_address, workers=workers), stopping_at_once():
-            return Conductor(folder, cells, ledger, Resources(gpus=asked.gpus)).conduct()
+            resources = Resources(gpus=asked.gpus)
+            refuse_lack(resources, waits=asked.ray_address is not None)
+            return Conductor(folder, cells, ledger, resources).conduct()
 
 
 def check(asked: Retrain) -> None:
@@ -121,6 +123,8 @@ def check(asked: Retrain) -> None:
     for name, least in (("most", 1), ("episodes", 1), ("workers", 0), ("gpus", 0)):
         if (value := getattr(asked, name)) is not None and value < least:
             raise ValueError(f"--{name} is {value}, it must be at least {least}")
+    if asked.workers and asked.ray_address is not None:
+        raise ValueError("--workers is of this machine; a cluster decides itself, by --gpus of each design")
 
 
 def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
@@ -139,7 +143,7 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
     if not lines:
         raise ValueError(f"no run of {', '.join(asked.arms)} has an optimised design yet; let the study go on")
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for line in lines for key in line)), lineterminator="\n")
     writer.writeheader()
     writer.writerows(lines)
     write_whole(path, text.getvalue())
@@ -150,8 +154,9 @@ def best_designs(runs: Runs, place: Place, arm: str, asked: Retrain) -> Iterator
     """The best share of what an arm found in one environment and task, best first."""
     found = [(run, row) for run in runs.of(place, arm) for row in run.designs if row["kind"] == "optimised"]
     found.sort(key=lambda pair: -pair[1]["best_return"])
+    over = {"over": str(sum(run.over for run in runs.of(place, arm))), "planned": str(runs.planned[*place, arm])}
     for run, row in found[: min(asked.most, math.ceil(asked.top * len(found)))]:
-        yield line_of(run, row)
+        yield line_of(run, row) | over
 
 
 def line_of(run: Run, row: Row) -> dict[str, str]:

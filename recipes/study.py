@@ -19,9 +19,8 @@ import tyro
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores
 from recipes.results import write_whole
-from recipes.studies.conduct import RETRIES, Conductor, Resources, lacking, ray_running
+from recipes.studies.conduct import RETRIES, Conductor, Resources, ray_running, refuse_lack, take_up
 from recipes.studies.definition import Study, from_json, to_json
-from recipes.studies.ledger import Ledger
 from recipes.studies.named import STUDIES
 
 
@@ -52,16 +51,16 @@ def main(options: Options) -> None:
     try:
         with locked(folder), stopping_at_once():
             cells = study.cells()
-            ledger = Ledger(folder / "ledger.csv", cells)
+            ledger = take_up(folder, cells)
             write_whole(folder / "study.json", to_json(study))
-            print(f"{study.name}: {len(ledger.in_state('waiting'))} of {len(cells)} cells to compute -> {folder}")
+            waiting = len(ledger.in_state("waiting"))
+            print(f"{study.name}: {waiting} of {len(cells)} cells to compute -> {folder}")
+            if not waiting:
+                return
             # Ray takes SIGTERM for itself when it starts.
             with ray_running(address=options.ray_address, workers=workers, cpus=options.cpus), stopping_at_once():
                 resources = Resources(options.cpus, options.gpus)
-                if lack := lacking(resources):
-                    if options.ray_address is None:
-                        raise ValueError(f"{lack} here; ask for less by --cpus and --gpus")
-                    print(f"{lack}; waiting for one", flush=True)
+                refuse_lack(resources, waits=options.ray_address is not None)
                 failed = Conductor(folder, cells, ledger, resources).conduct()
     except Stopped as stop:
         print(f"\n{stop}; to go on: {command(options)}", file=sys.stderr)

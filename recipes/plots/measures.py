@@ -75,7 +75,8 @@ def predictions(run: Run) -> list[Row]:
     A constant reward r has the discounted value r / (1 - gamma) and, over T steps, the return r T. So (1 - gamma) Q and
     return / T are both a mean reward per step, and agree if the reward is the same all the time. They are not the same
     mean otherwise: Q weighs the first 1 / (1 - gamma) steps after a start, the return all T alike; Q is of the
-    population's policy before anything was learnt on the body, the return the best of the individual policy after it.
+    population's policy before anything was learnt on the body, the return the best of the individual policy after it;
+    and Q holds the entropy bonus of Eq. 3, of up to alpha times the entropy of an action in each step.
     """
     gamma, steps = run.record.settings["gamma"], run.record.settings["episode_steps"]
     return [

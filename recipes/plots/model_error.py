@@ -60,6 +60,9 @@ def plots(study: Path) -> Iterator[Plot]:
         yield missing("figure_4a_model_error", f"No model error was measured: {line}")
     for folder in folders:
         environment, rows = read_config(folder)["environment"], read(folder / FILE)
+        if not rows:
+            yield missing(f"figure_4a_model_error_{environment}", f"{folder / FILE} has no measurement yet.")
+            continue
         figure, grid = new_figure(6.4, len(UNITS), len(MODELS), sharex=True)
         panels = iter(grid)
         for unit, words in UNITS.items():
@@ -121,6 +124,8 @@ def describe(environment: str, rows: Sequence[Row]) -> str:
         last.append(f"a model that {words}: {told}")
     return (
         f"Squared error of the ensemble's mean prediction on {environment}, {runs} run(s), over training; both models "
-        "learn from the same batches. Above in variances of one-step changes in the replay, below in the raw units of "
+        "learn from the same batches. Seen: one more episode of each design, by the policy that learnt on it; next "
+        "and never built: episodes by the population's policy of that time. Runs that diverge are measured until then. "
+        "Above in variances of one-step changes in the replay, below in the raw units of "
         f"the observation, as the paper prints it. At the end, in variances, {'; '.join(last)}."
     )

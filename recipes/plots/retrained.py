@@ -34,7 +34,7 @@ def plots(study: Path) -> Iterator[Plot]:
     if not rows:
         yield missing(NAME, f"None of {len(listed)} designs is retrained yet: python -m recipes.retrain {study}.")
         return
-    yield draw(rows, len(listed))
+    yield draw(rows, len(listed), early(listed))
 
 
 def results(folder: Path, listed: Sequence[dict[str, str]]) -> list[Cells]:
@@ -61,7 +61,18 @@ def results(folder: Path, listed: Sequence[dict[str, str]]) -> list[Cells]:
     ]
 
 
-def draw(rows: Sequence[Cells], planned: int) -> Plot:
+def early(listed: Sequence[dict[str, str]]) -> str:
+    """Whose designs were chosen before all runs of the arm were over, in words; those found later had no chance."""
+    counts = {
+        (line["environment"], line["task"], line["arm"]): (line["over"], line["planned"])
+        for line in listed
+        if line.get("over") != line.get("planned")
+    }
+    told = [f"{', '.join(which)}: {over} of {planned}" for which, (over, planned) in counts.items()]
+    return f"Chosen before all runs were over ({'; '.join(told)}). " if told else ""
+
+
+def draw(rows: Sequence[Cells], planned: int, early: str = "") -> Plot:
     """A panel for each environment and task."""
     places = list(dict.fromkeys((str(row["environment"]), str(row["task"])) for row in rows))
     figure = Figure(figsize=(max(3.6, 2.6 * len(places)), 3.4), layout="constrained")
@@ -80,7 +91,8 @@ def draw(rows: Sequence[Cells], planned: int) -> Plot:
     caption = (
         "Highest return of the deterministic policy of plain SAC, trained from scratch on the best designs of each arm "
         "(boxes: quartiles and median, whiskers: all designs; points: designs). "
-        f"{len(rows)} of {planned} designs are retrained, {diverged} of them diverged. {'; '.join(said)}"
+        f"{len(rows)} of {planned} designs are retrained, {diverged} of them diverged"
+        f"{' and count with the best return until then' if diverged else ''}. {early}{'; '.join(said)}"
         f"{'. ' if said else ''}The test takes designs for independent, as the paper does; those of one run are not."
     )
     return Plot(name=NAME, figure=figure, rows=rows, caption=caption)

@@ -19,6 +19,7 @@ from recipes.reporting.curves import new_figure
 from recipes.reporting.palette import BLACK, GREY, put_legend
 
 LABELS = {"area": "area: mean best return of a design (1)", "final": "final: highest best return (1)"}
+ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not"
 INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
 
 
@@ -52,7 +53,8 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
         f"intervals; ticks: means. {INTERVALS}area: the mean over designs of a design's best return; final: the "
         "highest of all designs. rank_correlation: Spearman's, of Q(xi) before a body was built and the best return on "
         "it, mean over runs. bias: (1 - gamma) Q(xi) - best return / steps, both a reward per step, equal if the "
-        f"reward is constant. hours and updates: mean of a run. {runs.in_words(runs.arms)}"
+        f"reward is constant; {ENTROPY}. hours: wall-clock of a run's cell; hours and updates: mean over runs. "
+        f"{runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_arms", figure=figure, rows=rows, caption=caption, readable=True)
 
@@ -68,7 +70,7 @@ def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cell
         row |= {f"{name}_mean": float(mean(values)) if over else np.nan}
         row |= {f"{name}_iqm": float(iqm(values)) if over else np.nan} | limits(f"{name}_iqm", iqm, values)
     for name, attribute in (("rank_correlation", "correlation"), ("bias", "bias")):
-        values = np.array([getattr(m, attribute) for m in own])
+        values = np.array([getattr(m, attribute) for m in over])
         values = values[np.isfinite(values)]
         row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
     for name in ("hours", "updates"):
@@ -121,7 +123,7 @@ def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
         f"best-return curve and by the highest best return. {INTERVALS}Over all environments and tasks each counts "
         "alike and is resampled by itself. welch_p: Welch's t-test, two-sided; paired_p: paired t-test of runs that "
         "share their seed and first designs (with five pairs Wilcoxon's test cannot go below 0.0625); _holm: corrected "
-        f"by Holm over all tests of a measure in this table. {runs.in_words(runs.arms)}"
+        f"by Holm over all tests of that kind by that measure in this table. {runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_pairs", figure=figure, rows=rows, caption=caption, readable=True)
 
@@ -158,7 +160,7 @@ def predicted(runs: Runs) -> Plot:
         "Eq. 5 before anything was learnt on a body, against the best return on it, a point for each design. "
         "(1 - gamma) Q and return / steps are both a reward per step and equal (dashed) if the reward is constant; Q "
         "weighs the first 1 / (1 - gamma) steps, and is of the population's policy, the return of the best individual "
-        f"one. {runs.in_words(runs.arms)}"
+        f"one; {ENTROPY}. {runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_predictions", figure=figure, rows=rows, caption=caption)
 

@@ -99,7 +99,8 @@ def true_change(
     observation, action = (row[key].expand(len(every), -1) for key in ("observation", "action"))
     truth = simulator.step(observation, action, every)
     change = model.wrapped(truth.next_observation[1:] - truth.next_observation[:1])
-    return change.masked_fill(truth.broken[1:, None], torch.nan), truth.depth[1:]
+    broken = truth.broken[1:] | truth.broken[0]
+    return change.masked_fill(broken[:, None], torch.nan), truth.depth[1:]
 
 
 def design_space(

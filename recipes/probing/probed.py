@@ -94,13 +94,18 @@ class ProbedCoAdaptation:
         """Both, by what they predict."""
         return {learner.ensemble.predict: learner for learner in (self.algorithm.dynamics, self.other)}
 
+    @property
+    def updates_per_episode(self) -> int:
+        """The algorithm's, and those of the other model."""
+        return self.algorithm.updates_per_episode + self.algorithm.model_updates
+
     def __iter__(self) -> Iterator[Event]:
         if self._table is None:
             self._table = Table(self.path, COLUMNS)
         for event in self.algorithm:
             if isinstance(event, DesignChosen) and event.index > 0:
                 rows = self.probes.trajectory(self.algorithm.population.policy, event.design, seed=self._seed())
-                self._write(event.index, 0, "next", rows)
+                self._write(event, "next", rows)
             elif isinstance(event, EpisodeDone):
                 self._learn()
                 first = event.index < len(self.algorithm.first_designs)
@@ -155,35 +160,35 @@ class ProbedCoAdaptation:
 
     def _measure(self, event: EpisodeDone) -> None:
         """All that is measured after an episode."""
-        seed, policies, at = self._seed(), self.algorithm, (event.index, event.episode + 1)
+        seed, policies = self._seed(), self.algorithm
         del self.seen[event.index :]
         self.seen.append(self.probes.trajectory(policies.individual.policy, event.design, seed=seed))
         seen = joined(self.seen)
-        self._write(*at, "seen", seen)
+        self._write(event, "seen", seen)
         strangers = self.probes.unseen_trajectories(policies.population.policy, seed=seed)
-        self._write(*at, "never built", strangers)
+        self._write(event, "never built", strangers)
         for name, generator in self.swaps.items():
             rows, impossible = self.probes.swapped(seen, generator, seed=seed)
             share = impossible.float().mean(0)
-            self._write(*at, name, rows, impossible_share=share)
+            self._write(event, name, rows, impossible_share=share)
             rows["next", "terminated"] |= impossible.unsqueeze(-1)
-            self._write(*at, f"{name} possible", rows)
+            self._write(event, f"{name} possible", rows)
 
     def _write(
         self,
-        index: int,
-        episode: int,
+        event: DesignChosen | EpisodeDone,
         probe: str,
         rows: TensorDictBase,
         *,
         impossible_share: torch.Tensor | None = None,
     ) -> None:
-        """A row for each run and each model, the last of which says that nothing changes."""
+        """A row for each run that still learns and each model, the last of which says that nothing changes."""
         variance = change_variance(self.learners["delta"])
         valid = ~rows["next", "terminated"][..., 0]
         errors = {predict: prediction_error(one.ensemble, rows) for predict, one in self.learners.items()}
         errors["nothing"] = persistence_error(self.other.ensemble, rows)
-        counts, at = valid.sum(0).tolist(), (index + 1, episode, self.algorithm.env_steps, probe)
+        episode = event.episode + 1 if isinstance(event, EpisodeDone) else 0
+        counts, at = valid.sum(0).tolist(), (event.index + 1, episode, self.algorithm.env_steps, probe)
         shares = [None] * len(counts) if impossible_share is None else impossible_share.tolist()
         self._table.append(
             [run, *at, predict, *square, count, share]
@@ -191,6 +196,7 @@ class ProbedCoAdaptation:
             for run, (square, count, share) in enumerate(
                 zip(zip(*(x.tolist() for x in mean_squares(error, variance, valid))), counts, shares)
             )
+            if run not in event.diverged  # its own model is frozen, and the other one is not
         )
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 import os
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+from coim.envs import BODIES
 from recipes.experiment import run
 from recipes.interrupt import LOCK
 from recipes.results import now
-from recipes.settings import Settings, refuse_changes, saved_settings
-from recipes.studies.definition import BODIES
+from recipes.settings import FREE, Settings, plain, read_config, refuse_changes, saved_settings
 
 STARTED = "started"  # how a line of a log begins with which a try began
+OF_NO_NUMBER = FREE | {"out", "device", "name"}  # a finished run is what it is wherever it was made and is called
 
 
 def compute(environment: str, settings: Settings, log: Path) -> None:
@@ -55,6 +57,28 @@ def to_go_on(settings: Settings) -> Settings:
     resumed = dataclasses.replace(settings, out=saved.out, resume=folder)  # a study's folder may have been moved
     refuse_changes(saved, resumed)
     return resumed
+
+
+def still_finished(settings: Settings, folder: Path) -> bool:
+    """Whether a cell that was finished once is what the study asks for now.
+
+    Returns:
+        False if its folder is gone, or if it is to try more designs than it has tried.
+
+    Raises:
+        ValueError: if it was made with other settings: it would be compared with runs of another protocol.
+    """
+    if not (folder / "config.json").exists():
+        return False
+    saved, asked = read_config(folder)["settings"], json.loads(json.dumps(plain(settings)))
+    more = asked["num_designs"] > saved["num_designs"]
+    fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})
+    if other := [name for name in sorted(fixed) if saved[name] != asked[name]]:
+        told = ", ".join(f"{name} ({saved[name]!r} to {asked[name]!r})" for name in other)
+        raise ValueError(
+            f"the run in {folder} was made with other settings: {told}; leave them, or take another folder"
+        )
+    return not more
 
 
 def tries(log: Path) -> int:

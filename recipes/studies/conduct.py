@@ -25,11 +25,12 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from recipes.settings import Settings, episodes_of
-from recipes.studies.cell import compute, episodes_done, seconds_of, tries
+from recipes.studies.cell import compute, episodes_done, seconds_of, still_finished, tries
 from recipes.studies.definition import Cell
 from recipes.studies.ledger import Ledger
 
 RETRIES = 2  # of a cell that fails, and of one whose process dies
+CELLS = "cells"  # of a study's folder
 POLL = 0.5  # s between two looks at who has begun
 OBJECT_STORE = 80 * 2**20  # bytes; what a cell makes is on disk, nothing goes through Ray
 
@@ -143,7 +144,7 @@ class Conductor:
         return dataclasses.replace(cell.settings, out=self.folder_of(cell), threads=self.resources.cpus, **device)
 
     def folder_of(self, cell: Cell) -> Path:
-        return self.folder / "cells" / cell.name
+        return self.folder / CELLS / cell.name
 
     def log_of(self, cell: Cell) -> Path:
         return self.folder / "logs" / f"{cell.name}.log"
@@ -185,6 +186,40 @@ class Conductor:
 
     def _say(self, cell: Cell, words: str) -> None:
         print(f"{time.strftime('%H:%M:%S')}  {cell.name}  {words}", file=self._terminal, flush=True)
+
+
+def take_up(folder: Path, cells: list[Cell]) -> Ledger:
+    """The ledger of a study, in which what was finished waits again if it is gone or has more designs to try.
+
+    Args:
+        folder: of the study.
+        cells: of the study.
+
+    Raises:
+        ValueError: if a finished cell was made with other settings than the study has now.
+    """
+    ledger = Ledger(folder / "ledger.csv", cells)
+    for cell in cells:
+        finished = ledger.entries[cell.name].state == "finished"
+        if finished and not still_finished(cell.settings, folder / CELLS / cell.name):
+            ledger.note(cell.name, "waiting", seconds=None)
+    return ledger
+
+
+def refuse_lack(resources: Resources, *, waits: bool) -> None:
+    """Say what no node has, before cells wait for it.
+
+    Args:
+        resources: of each cell.
+        waits: whether a node that has them may still come.
+
+    Raises:
+        ValueError: if none will come: the cells would wait for ever.
+    """
+    if lack := lacking(resources):
+        if not waits:
+            raise ValueError(f"{lack} here; ask for less")
+        print(f"{lack}; waiting for one", flush=True)
 
 
 def lacking(resources: Resources) -> str:

@@ -9,14 +9,8 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from coim import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
+from coim.envs import BODIES
 from recipes.settings import PRESETS, Settings
-
-BODIES: dict[str, type[MorphEnv]] = {
-    "half_cheetah": HalfCheetahMorph,
-    "walker": WalkerMorph,
-    "hopper": HopperMorph,
-}
 
 # What is compared. All arms of a seed share the first designs, the initial weights and the reset noise.
 ARMS: dict[str, dict[str, Any]] = {
@@ -69,7 +63,7 @@ class Block:
     """Every combination of what is listed here."""
 
     environments: tuple[str, ...]
-    """Of half_cheetah, walker, hopper."""
+    """Of half_cheetah, hopper, walker."""
     arms: tuple[str, ...]
     """What is compared: none, known, noisy, random, control-only, random-bodies, oracle."""
     seeds: tuple[int, ...]

@@ -68,6 +68,7 @@ def test_the_table_of_arms_counts_planned_and_diverged_runs(study: Path) -> None
         "known", "5", "2", "1", "0.5",
     ]  # fmt: skip
     assert float(known["final_mean"]) == (42 + 24) / 2
+    assert float(known["bias"]) == pytest.approx((-3.0 - 2.3) / 2)  # of the runs that are over, as all in the row
     assert float(known["area_mean"]) == pytest.approx((27 + (14 + 24 + 1 + 1) / 4) / 2)
     assert (none["over"], float(none["final_iqm"])) == ("4", 30)
     text = (study / "figures" / "statistics_arms.md").read_text()

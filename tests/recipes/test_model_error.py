@@ -142,6 +142,40 @@ def test_a_fleet_has_a_row_for_each_run(tmp_path: Path) -> None:
     assert rows[0]["mse"] != rows[1]["mse"]
 
 
+def test_a_run_of_a_fleet_that_diverges_is_measured_no_more_and_is_not_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(**{**vars(TINY), "num_designs": 3, "num_runs": 2})
+    measured = probe(HopperMorph, settings, tmp_path, every=1, rows=4)
+    monkeypatch.setattr("recipes.model_error.SIDE", 3)
+    learner, losses = measured.algorithm.population, []
+    learn = learner.update
+
+    def spoil(batches: TensorDict) -> TensorDict:
+        losses.append(learn(batches))
+        if len(losses) == 2:
+            learner.weights_by_run()[0][0] = torch.nan
+        return losses[-1]
+
+    monkeypatch.setattr(learner, "update", spoil)
+    list(measured)
+    assert measured.divergence.places == {0: (0, 1)}
+    rows = read(tmp_path / probed.FILE)
+    assert {(row["design"], row["episode"]) for row in rows if row["run"] == "0"} == {("1", "1")}
+    assert {row["design"] for row in rows if row["run"] == "1"} == {"1", "2", "3"}
+    write_design_space(measured, HopperMorph, tmp_path)
+    drawn = {row["xi_1"] for row in read(tmp_path / "design_space.csv") if row["point"] == "tried"}
+    own = [rows["design"][0, 1, 0].item() for rows in measured.seen]
+    assert sorted(map(float, drawn)) == pytest.approx(sorted(own), rel=1e-6)
+    measured.divergence.places[1] = (2, 1)
+    assert "the run diverged" in write_design_space(measured, HopperMorph, tmp_path)
+
+
+def test_the_speed_that_is_shown_counts_the_second_model_too(tmp_path: Path) -> None:
+    measured = probe(HopperMorph, Settings(**{**vars(TINY), "model_updates": 5}), tmp_path, every=2, rows=4)
+    assert (measured.algorithm.updates_per_episode, measured.updates_per_episode) == (2 + 2 + 5, 2 + 2 + 5 + 5)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -189,6 +223,16 @@ def test_the_figures_show_what_was_measured(study: Path) -> None:
     assert f"seen {seen[-1]:.3g}" in errors.caption
     states, sources = {row["state"] for row in space.rows}, 3
     assert len(space.figure.axes) == len(states) * sources + 1  # and the scale of the colours
+
+
+def test_a_measured_run_without_a_measurement_yet_is_told_not_drawn(study: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "model_error"
+    folder.mkdir()
+    (folder / "config.json").write_text((study / "model_error" / "config.json").read_text())
+    (folder / probed.FILE).write_text(",".join(probed.COLUMNS) + "\n")
+    (plot,) = model_error.plots(tmp_path)
+    assert plot.figure is None
+    assert "has no measurement yet" in plot.caption
 
 
 def test_without_its_input_a_figure_says_what_to_run(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from coim import HopperMorph
 from recipes import experiment
 from recipes.figures import write_figures
+from recipes.plots import retrained
 from recipes.plots.runs import read_runs
 from recipes.retrain import Retrain, best_designs, cell_of, choose, main
 from recipes.settings import Settings, parse, plain
@@ -73,22 +75,31 @@ def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_on
     assert other.first_episodes == settings.first_episodes
 
 
-def test_designs_are_retrained_once_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+@pytest.mark.usefixtures("cluster")
+def test_designs_are_retrained_once_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recipes.retrain.ray_running", lambda **_: contextlib.nullcontext())  # on the cluster there is
     for arm in ("none", "known"):
         folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
         experiment.main(HopperMorph, "hopper", [*TINY, "--designs", arm, "--quiet", "--out", str(folder)])
+    with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
+        main([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
+    capsys.readouterr()
     main([str(tmp_path), "--episodes", "2", "--workers", "1"])
     assert "2 of 2 designs to train" in capsys.readouterr().out
     chosen = read_table(tmp_path / "retrained" / "designs.csv")
     for line in chosen:
         cell = tmp_path / "cells" / line["cell"]
         found = next(row for row in read_table(cell / "designs.csv") if row["kind"] == "optimised")
-        retrained = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
-        assert [row["kind"] for row in retrained] == ["first", "first"]
-        assert [row["episode"] for row in retrained] == ["1", "2"]
-        assert all(row[f"xi_{i}"] == found[f"xi_{i}"] for row in retrained for i in range(1, 5))
+        episodes = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert [row["kind"] for row in episodes] == ["first", "first"]
+        assert [row["episode"] for row in episodes] == ["1", "2"]
+        assert all(row[f"xi_{i}"] == found[f"xi_{i}"] for row in episodes for i in range(1, 5))
     main([str(tmp_path), "--episodes", "2", "--workers", "1"])
     assert "0 of 2 designs to train" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"made with other settings: first_episodes \(2 to 3\)"):
+        main([str(tmp_path), "--episodes", "3"])
     write_figures(tmp_path)
     rows = read_table(tmp_path / "figures" / "figure_2_retrained.csv")
     for row, line in zip(rows, chosen, strict=True):
@@ -96,11 +107,23 @@ def test_designs_are_retrained_once_and_drawn(tmp_path: Path, capsys: pytest.Cap
         assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
 
 
+def test_designs_that_were_chosen_before_all_runs_were_over_say_so(study: Path) -> None:
+    write_cell(study, "hopper-forward-known-8", [90, 20])
+    (study / "retrained").mkdir()
+    lines = choose(read_runs(study), study / "retrained" / "designs.csv", Retrain(study=study))
+    assert {(line["arm"], line["over"], line["planned"]) for line in lines} == {("known", "5", "6"), ("none", "2", "2")}
+    for line in lines:
+        write_cell(study, line["folder"], [1], part="retrained/cells", num_designs=1)
+    (plot,) = retrained.plots(study)
+    assert "Chosen before all runs were over (hopper, forward, known: 5 of 6). " in plot.caption
+
+
 def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:
     for options, words in (
         (["--top", "0"], "--top is 0"),
         (["--most", "0"], "--most is 0"),
         (["--episodes", "0"], "--episodes is 0"),
+        (["--workers", "2", "--ray-address", "auto"], "a cluster decides itself"),
         (["--arms", "oracle"], "'oracle' is no arm of .*there are none, known"),
     ):
         with pytest.raises(SystemExit, match=words):

@@ -9,9 +9,12 @@ from pathlib import Path
 import pytest
 from interrupted_runs import TINY, cut
 
-from recipes.settings import Settings
+from coim import EpisodeDone
+from coim.envs import BODIES
+from recipes.experiment import build
+from recipes.settings import Settings, plain
 from recipes.studies.cell import compute, episodes_done, seconds_of, to_go_on, tries
-from recipes.studies.conduct import all_episodes, in_words
+from recipes.studies.conduct import all_episodes, in_words, take_up
 from recipes.studies.definition import ARMS, PROTOCOLS, Block, Study, from_json, to_json
 from recipes.studies.ledger import Ledger, read_ledger
 from recipes.studies.named import STUDIES
@@ -45,6 +48,26 @@ def test_arms_of_a_seed_differ_in_nothing_but_the_arm() -> None:
     assert {cell.settings.seed for cell in cells} == {5}
 
 
+def test_arms_of_a_seed_compute_the_same_until_something_is_imagined_for_them() -> None:
+    """On the first body no individual network has met the population's: whatever differs there is a stream that moved.
+
+    The random bodies are the same later on too.
+    """
+    first, random = {}, {}
+    for cell in study(arms=tuple(ARMS), seeds=(5,), overrides={"first_episodes": 2, "num_designs": 7}).cells():
+        episodes = [event for event in build(BODIES["hopper"], cell.settings) if isinstance(event, EpisodeDone)]
+        first[cell.arm] = [
+            (float(e.training_return), float(e.evaluation_return), float(e.metrics["individual/loss_qvalue"]))
+            for e in episodes
+            if e.index == 0
+        ]
+        random[cell.arm] = [e.design.tolist() for e in episodes if e.kind == "random"][:1]
+    assert len(first["none"]) == 2
+    assert all(numbers == first["none"] for numbers in first.values())
+    assert random.pop("control-only") == []
+    assert all(bodies == random["none"] for bodies in random.values())
+
+
 def test_seeds_can_share_a_cell_along_the_run_axis() -> None:
     cells = study(arms=("none",), seeds=(0, 1, 2, 3, 4), seeds_per_cell=2).cells()
     assert [(cell.settings.seed, cell.settings.num_runs) for cell in cells] == [(0, 2), (2, 2), (4, 1)]
@@ -63,7 +86,7 @@ def test_a_study_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"environments": ("ant",)}, "'ant' is none of the environments that there are: half_cheetah, walker, hopper"),
+        ({"environments": ("ant",)}, "'ant' is none of the environments that there are: half_cheetah, hopper, walker"),
         ({"arms": ("oracel",)}, "'oracel' is none of the arms"),
         ({"tasks": ("up",)}, "'up' is none of the tasks"),
         ({"protocol": "papre"}, "'papre' is none of paper, "),
@@ -114,6 +137,43 @@ def test_the_ledger_keeps_what_is_finished_and_lets_all_else_wait(tmp_path: Path
     assert (again.entries[cells[0].name].seconds, again.entries[cells[1].name].tries) == (2.5, 2)
     with pytest.raises(ValueError, match="has the cell hopper-forward-none-4, which this study has not"):
         Ledger(tmp_path / "ledger.csv", study(seeds=(3,)).cells())
+
+
+def finished_study(folder: Path, **fields: object) -> Study:
+    """A study whose cells the ledger calls finished, with the settings that they were made with and nothing else."""
+    made = study(seeds=(3,), **fields)
+    ledger = Ledger(folder / "ledger.csv", made.cells())
+    for cell in made.cells():
+        own = folder / "cells" / cell.name
+        own.mkdir(parents=True)
+        config = {"environment": "hopper", "settings": plain(dataclasses.replace(cell.settings, out=own, threads=3))}
+        (own / "config.json").write_text(json.dumps(config))
+        ledger.note(cell.name, "finished", seconds=1.0)
+    return made
+
+
+def test_a_finished_cell_waits_again_if_it_is_gone_or_has_more_designs_to_try(tmp_path: Path) -> None:
+    made = finished_study(tmp_path, overrides={"num_cells": (4,)})
+    none, known = (cell.name for cell in made.cells())
+    assert take_up(tmp_path, made.cells()).in_state("finished") == [none, known]
+    (tmp_path / "cells" / known / "config.json").unlink()
+    (tmp_path / "cells" / known).rmdir()
+    assert take_up(tmp_path, made.cells()).in_state("waiting") == [known]
+    assert [row.state for row in read_ledger(tmp_path / "ledger.csv")] == ["finished", "waiting"]
+    more = study(seeds=(3,), overrides={"num_cells": (4,), "num_designs": 9})
+    assert take_up(tmp_path, more.cells()).in_state("waiting") == [none, known]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [({"episodes": 2}, r"none-3 was made with other settings: episodes \(1 to 2\)"), ({"num_designs": 5}, "6 to 5")],
+)
+def test_a_finished_cell_of_another_protocol_is_not_compared_with_what_is_computed_now(
+    tmp_path: Path, overrides: dict, sentence: str
+) -> None:
+    finished_study(tmp_path)
+    with pytest.raises(ValueError, match=sentence):
+        take_up(tmp_path, study(overrides=overrides).cells())
 
 
 def test_a_ledger_grows_with_its_study(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import os
 import shlex
 import signal
@@ -12,35 +13,27 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from coim import HopperMorph
+from recipes.experiment import run as run_recipe
 from recipes.soak import differences
-from recipes.studies.conduct import Conductor, Resources, lacking, ray_running
-from recipes.studies.definition import Study, to_json
+from recipes.studies.conduct import Conductor, Resources, lacking
+from recipes.studies.definition import Block, Study, to_json
 from recipes.studies.ledger import Ledger, read_ledger
 from recipes.study import entry
 
-ray_cluster = pytest.importorskip("ray.cluster_utils")
-SLOWER = {"num_designs": 8, "individual_updates": 150}  # an episode takes long enough to be hit
+pytest.importorskip("ray.cluster_utils")
+SLOWER = {"num_designs": 7, "individual_updates": 150}  # an episode takes long enough to be hit
 
 
 def study(**fields: object) -> Study:
     least = {"name": "test", "environments": ("hopper",), "arms": ("none",), "seeds": (0,), "protocol": "smoke"}
     return Study(**{**least, **fields})
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator:
-    """A head without cores, as on clusters whose head has other work, and one node with two."""
-    nodes = ray_cluster.Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
-    nodes.add_node(num_cpus=2)
-    with ray_running(address=nodes.address):
-        yield nodes
-    nodes.shutdown()
 
 
 def conduct(folder: Path, what: Study) -> tuple[list[str], Ledger]:
@@ -94,17 +87,19 @@ def test_every_cell_of_a_study_is_an_ordinary_run_and_pairs_share_their_first_de
 
 @pytest.mark.usefixtures("cluster")
 def test_a_cell_whose_process_is_killed_goes_on_from_its_checkpoint_to_the_same_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     what, cell = study(arms=("known",), overrides=SLOWER), "hopper-forward-known-0"
-    conduct(tmp_path / "peace", what)
-    capsys.readouterr()
+    monkeypatch.setattr("recipes.experiment.draw_run", lambda folder, body: folder)
+    monkeypatch.setattr("recipes.experiment.write_report", lambda folders, body: folders[0])
+    peace = tmp_path / "peace" / "cells" / cell
+    run_recipe(HopperMorph, "hopper", dataclasses.replace(what.cells()[0].settings, out=peace, threads=1))
     killing = meanwhile(tmp_path / "killed", cell, rows=3, act=lambda pid: os.kill(pid, signal.SIGKILL))
     failed, ledger = conduct(tmp_path / "killed", what)
     killing.join()
     assert failed == []
     assert (ledger.entries[cell].state, ledger.entries[cell].tries) == ("finished", 2)
-    assert differences(*(tmp_path / name / "cells" / cell for name in ("peace", "killed"))) == []
+    assert differences(peace, tmp_path / "killed" / "cells" / cell) == []
     out, err = capsys.readouterr()
     assert [line.split(maxsplit=2)[2].split(" in ")[0] for line in out.splitlines()] == [
         "started",
@@ -128,7 +123,7 @@ def test_a_cell_whose_node_dies_goes_on_on_another(cluster: Any, tmp_path: Path)
     losing.join()
     assert failed == []
     assert ledger.entries[cell].tries == 2
-    assert len(read(tmp_path / "cells" / cell / "evaluations.csv")) == 8
+    assert len(read(tmp_path / "cells" / cell / "evaluations.csv")) == 7
 
 
 @pytest.mark.usefixtures("cluster")
@@ -155,7 +150,8 @@ def test_a_cell_that_fails_is_tried_again_twice_and_the_others_are_computed(
 def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    what, cells = study(arms=("none", "known"), overrides=SLOWER), ["hopper-forward-none-0", "hopper-forward-known-0"]
+    brief = Block(environments=("hopper",), arms=("known",), seeds=(0,), overrides={"num_designs": 1})
+    what, cells = study(overrides=SLOWER, blocks=(brief,)), ["hopper-forward-none-0", "hopper-forward-known-0"]
     (tmp_path / "my.json").write_text(to_json(what))
     folder = tmp_path / "my study"
     arguments = [str(tmp_path / "my.json"), "--out", str(folder), "--workers", "1"]
@@ -165,7 +161,7 @@ def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | temporary,
+        env=os.environ | temporary | {"RAY_worker_niceness": "0"},
     )
 
     def refuse_another_and_stop(pid: int) -> None:
@@ -191,7 +187,7 @@ def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it
     monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())  # on the cluster there is
     entry(told[9:])
     assert [(row.state, row.tries) for row in read_ledger(folder / "ledger.csv")] == [("finished", 2), ("finished", 1)]
-    assert len(read(folder / "cells" / cells[0] / "evaluations.csv")) == 8
+    assert [len(read(folder / "cells" / cell / "evaluations.csv")) for cell in cells] == [7, 1]
 
 
 def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
@@ -202,7 +198,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
         return ["hopper-forward-known-0"]
 
     monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
-    monkeypatch.setattr("recipes.study.lacking", lambda _: "")
+    monkeypatch.setattr("recipes.studies.conduct.lacking", lambda _: "")
     monkeypatch.setattr(Conductor, "conduct", fail)
     with pytest.raises(SystemExit) as ended:
         entry(["smoke", "--out", str(tmp_path / "s")])
