@@ -53,6 +53,8 @@ class TriedDesign:
         design: ``[D]``.
         predicted: Eq. 5 before the body was built; NaN where there was no start state yet.
         best_return: highest evaluation return.
+        diverged: where the run diverged on this design, as ``design 2, episode 1``, and ``best_return`` is the highest
+            until then; empty where it did not.
     """
 
     run: int
@@ -61,6 +63,7 @@ class TriedDesign:
     design: Tensor
     predicted: float
     best_return: float
+    diverged: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +244,7 @@ def read_designs(folder: Path) -> tuple[TriedDesign, ...]:
             design=torch.tensor([float(cell) for name, cell in row.items() if name.startswith("xi_")]),
             predicted=float(row["predicted"] or math.nan),
             best_return=float(row["best_return"] or math.nan),
+            diverged=row.get("diverged", ""),
         )
         for row in rows
     )

@@ -32,7 +32,7 @@ from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints
-from recipes.interrupt import Stopped, locked, says_read_only, stopping_at_once
+from recipes.interrupt import Stopped, end_soon, locked, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.progress import Progress
 from recipes.report import write_report
@@ -51,6 +51,12 @@ def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None
         run(body, name, parse(program, description, arguments))
     except (ValueError, OSError) as error:
         sys.exit(f"{type(error).__name__}: {error}")
+    except SystemExit as leaving:
+        if arguments is None and isinstance(leaving.__context__, Stopped):
+            end_soon(leaving.__context__.signum)
+        raise
+    except KeyboardInterrupt:  # before there was a run to go on with, or when it was over
+        sys.exit(130)
 
 
 def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
@@ -87,7 +93,8 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
             with stopping_at_once():
                 follow(algorithm, folder, name, settings)
         except Stopped as stop:
-            print(f"\n{stop}; {again}", file=sys.stderr)
+            begun = (folder / "config.json").is_file()
+            print(f"\n{stop}; {again if begun else 'nothing was written yet, start it again'}", file=sys.stderr)
             sys.exit(128 + stop.signum)
         except OSError as error:  # a full disk, most likely
             first = f"make {folder} writable; " if says_read_only(error) else ""

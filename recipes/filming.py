@@ -84,6 +84,8 @@ def film(folder: Path, *, design: str, run: int | None, steps: int | None, width
         raise ValueError(f"steps is {steps}, it must be at least 1; leave it out for the whole episode")
     torch.set_num_threads(1)  # as in training: another number could round otherwise
     loaded = load_run(folder)
+    if run is not None and not 0 <= run < loaded.bodies.numel():
+        raise ValueError(f"run {run} is not in {folder}, which has runs 0 .. {loaded.bodies.numel() - 1}")
     chosen = choose(loaded, design, run)
     if steps is not None:
         loaded.bodies.episode_steps = steps
@@ -103,15 +105,17 @@ def choose(loaded: SavedRun, design: str, run: int | None) -> list[TriedDesign]:
         (tried for tried in loaded.designs if math.isfinite(tried.best_return) and run in (None, tried.run)),
         key=lambda tried: -tried.best_return,
     )
+    whose = "" if run is None else f" of run {run}"
     if not ranked:
-        whose = "no design" if run is None else f"no design of run {run}"
-        raise ValueError(f"{whose} in {loaded.folder} has a return yet; wait for the next row of its designs.csv")
+        raise ValueError(
+            f"no design{whose} in {loaded.folder} has a return yet; wait for the next row of its designs.csv"
+        )
     if design not in ("best", "top5", "all"):
+        done = sorted({tried.number for tried in ranked})
         ranked = [tried for tried in ranked if str(tried.number) == design]
         if not ranked:
-            done = sorted({tried.number for tried in loaded.designs})
             raise ValueError(
-                f"--design is {design!r}: choose best, top5, all or one of the designs that are done, {done}"
+                f"--design is {design!r}: choose best, top5, all or one of the designs that are done{whose}, {done}"
             )
     own = [tried for tried in ranked if tried.run == ranked[0].run]
     if design == "all":

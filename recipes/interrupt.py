@@ -6,12 +6,14 @@ import errno
 import fcntl
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
 LOCK = ".lock"
+PATIENCE = 3  # s
 READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
@@ -59,6 +61,17 @@ def stopping_at_once() -> Iterator[None]:
         for signum, handler in before.items():
             # Who was told to end stays within reach of a second Ctrl-C until the process is gone.
             signal.signal(signum, end if stopped else handler)
+
+
+def end_soon(signum: int) -> None:
+    """Let this process end by itself, but not later than in a few seconds, with the code of a signal.
+
+    The interpreter waits for threads that are not over: one that compiles takes half a minute. For a process whose
+    main thread is about to leave, and for no other.
+    """
+    timer = threading.Timer(PATIENCE, os._exit, [128 + signum])
+    timer.daemon = True
+    timer.start()
 
 
 @contextmanager

@@ -79,6 +79,9 @@ def returns(arm: str, settings: Settings, episodes: int) -> list[list]:
         if isinstance(event, EpisodeDone):
             rows.append([arm, settings.seed, event.episode + 1, f"{float(event.evaluation_return):.7g}"])
             print(*rows[-1], f"({event.seconds['episode']:.1f} s)", flush=True)
+    if (left := episodes - len(rows)) > 0:
+        print(f"{arm}, seed {settings.seed} diverged: its frozen policy's return stands for {left} episode(s)")
+        rows += [[arm, settings.seed, episodes - left + i + 1, rows[-1][-1]] for i in range(left)]
     return rows
 
 

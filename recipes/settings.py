@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -140,6 +141,10 @@ QUICK = Settings(
 
 # What may differ when a run is gone on with, because no number of its past depends on it.
 FREE = {"num_designs", "threads", "checkpoint_every", "resume", "wandb", "quiet"}
+# Counts that the parts refuse in their own words, or not at all; here by the option's name.
+LEAST = dict.fromkeys(
+    ("num_runs", "first_episodes", "episodes", "num_critics", "num_members", "checkpoint_every"), 1
+) | {"seed": 0, "threads": 0}
 PRESETS = {"paper": Settings(compile=True), "quick": QUICK}
 
 
@@ -163,14 +168,13 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
     if known.resume is not None:
         default = saved_settings(known.resume)
     settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
-    if settings.seed < 0:
-        first.error(f"--seed is {settings.seed}, it must be at least 0")
-    if settings.sigma < 0:
-        first.error(f"--sigma is {settings.sigma}, a standard deviation is at least 0")
+    if not 0 <= settings.sigma < math.inf:
+        first.error(f"--sigma is {settings.sigma}, a standard deviation is a finite number of at least 0")
     if settings.dream == "simulator" and settings.designs == "none":
         first.error("--dream simulator has nothing to imagine with --designs none; take known, noisy or random")
-    if settings.checkpoint_every < 1:
-        first.error(f"--checkpoint-every is {settings.checkpoint_every}, it must be at least 1")
+    for name, least in LEAST.items():
+        if (value := getattr(settings, name)) < least:
+            first.error(f"--{name.replace('_', '-')} is {value}, it must be at least {least}")
     if known.resume is not None:
         refuse_changes(default, settings)
     return settings

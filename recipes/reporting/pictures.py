@@ -31,10 +31,13 @@ def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
     returns.set(xlabel="design (number)", ylabel="best return of a design (1)")
     returns.spines[["top", "right"]].set_visible(False)
     explain(figure, [record], kinds=True, more=cross_handles([record]))
-    own = [row for row in record.designs if row["run"] == record.designs[0]["run"]]
+    # The best run's, as on the page: the first run may have diverged before it had many.
+    run = max(record.best.values() or record.designs, key=lambda row: row["best_return"])["run"]
+    own = [row for row in record.designs if row["run"] == run]
     best = sorted(own, key=lambda row: row["best_return"])[-BODIES_SHOWN:]
     draw_bodies(bodies, sorted(best, key=lambda row: row["design"]), body)
-    bodies.set_title("bodies at rest: number of the design, best return")
+    whose = f" of run {run}" if record.num_runs > 1 else ""
+    bodies.set_title(f"bodies{whose} at rest: number of the design, best return")
     path = folder / "figures" / "designs.png"
     save(figure, path)
     return path

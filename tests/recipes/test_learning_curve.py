@@ -6,9 +6,12 @@ import csv
 from pathlib import Path
 
 import pytest
+import torch
 
+from coim import EpisodeDone
 from recipes import learning_curve
 from recipes.learning_curve import Curve, main, read
+from recipes.settings import Settings
 
 
 @pytest.fixture
@@ -43,3 +46,15 @@ def test_what_is_there_is_not_run_again(tmp_path: Path, fast: list) -> None:
     main(Curve(out=tmp_path, seeds=(0, 1), episodes=2))
     assert fast[before:] == [("model-free", 1), ("known designs imagined", 1)]
     assert len([row for row in read(tmp_path / "curves.csv") if row["arm"] == "random policy"]) == 2
+
+
+def test_a_run_that_diverges_keeps_the_return_of_its_frozen_policy(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Else the curve of the whole arm would end where that of one seed does."""
+    nothing = torch.zeros(1)
+    done = EpisodeDone(0, "first", 0, torch.ones(1, 7), nothing, torch.tensor([4.0]), 1000, 0, {}, {"episode": 1.0})
+    monkeypatch.setattr(learning_curve, "build", lambda *args, **kwargs: [done])
+    rows = learning_curve.returns("model-free", Settings(seed=3), 3)
+    assert rows == [["model-free", 3, episode, "4"] for episode in (1, 2, 3)]
+    assert "model-free, seed 3 diverged: its frozen policy's return stands for 2 episode(s)" in capsys.readouterr().out

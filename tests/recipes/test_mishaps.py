@@ -11,9 +11,11 @@ import torch
 from interrupted_runs import cut, resume
 from interrupted_runs import run as run_tiny
 
-from coim import DynamicsLearner, HopperMorph, SACLearner
+from coim import DynamicsLearner, HopperMorph, SACLearner, load_run
 from recipes import soak
+from recipes.filming import choose
 from recipes.report import write_report
+from recipes.reporting.pictures import draw_run
 from recipes.reporting.records import read_record
 from tests.recipes.test_report import check
 
@@ -96,6 +98,30 @@ def test_what_is_left_of_a_diverged_design_is_not_a_finished_one(ill: Path) -> N
     assert not designs[1, 2]["finished"]
     assert designs[0, 2]["finished"]
     assert (1, 3) not in designs
+
+
+def test_a_script_finds_where_a_run_diverged(ill: Path) -> None:
+    found = {(design.run, design.number): design.diverged for design in load_run(ill).designs}
+    assert {key for key, place in found.items() if place} == {(1, 2)}
+    assert found[1, 2] == "design 2, episode 1"
+    assert (1, 3) not in found
+
+
+def test_a_design_that_a_diverged_run_never_had_is_not_offered_for_a_film(ill: Path) -> None:
+    with pytest.raises(ValueError, match=r"one of the designs that are done of run 1, \[1, 2\]"):
+        choose(load_run(ill), "3", 1)
+
+
+def test_the_picture_has_the_bodies_of_the_best_run(ill: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Were it the first run's, one that diverged early would leave a picture of a body or two."""
+    drawn: list[dict[str, Any]] = []
+    monkeypatch.setattr("recipes.reporting.pictures.draw_bodies", lambda axes, rows, body: drawn.extend(rows))
+    record = read_record(ill, "")
+    for row in record.designs:
+        row["best_return"] = 1.0 + row["run"]
+    monkeypatch.setattr("recipes.reporting.pictures.read_record", lambda *_: record)
+    draw_run(ill, HopperMorph)
+    assert [(row["run"], row["design"]) for row in drawn] == [(2, number) for number in (1, 2, 3, 4)]
 
 
 def test_a_run_that_was_cut_after_it_diverged_goes_on_as_the_whole_one(ill: Path, tmp_path: Path) -> None:

@@ -10,14 +10,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import torch
 from interrupted_runs import cut, resume, run
 
+from coim import HopperMorph
 from recipes import soak
 from recipes.checkpoint import Checkpoints
-from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.experiment import main
+from recipes.interrupt import Stopped, end_soon, locked, stopping_at_once
 from recipes.replay_file import ReplayFile
 
 
@@ -130,6 +133,34 @@ def test_a_second_signal_ends_the_process_at_once() -> None:
         process.terminate()
     process.join(30)
     assert process.exitcode == 128 + signal.SIGTERM
+
+
+def linger() -> None:
+    """What a process does that was told to end while another thread of it compiles."""
+    Thread(target=time.sleep, args=(60,)).start()
+    end_soon(signal.SIGTERM)
+
+
+def test_a_thread_that_is_not_over_does_not_keep_a_stopped_process() -> None:
+    process = soak.PLAIN.Process(target=linger)
+    process.start()
+    process.join(40)
+    assert process.exitcode == 128 + signal.SIGTERM
+
+
+def test_a_command_line_that_was_stopped_ends_soon_and_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, handlers: None
+) -> None:
+    told: list[int] = []
+    monkeypatch.setattr("recipes.experiment.end_soon", told.append)
+    monkeypatch.setattr("recipes.experiment.follow", lambda *args: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr("sys.argv", ["hopper", "--preset", "quick", "--out", str(tmp_path / "run"), "--quiet"])
+    with pytest.raises(SystemExit) as stop:
+        main(HopperMorph, "hopper")
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert told == [signal.SIGTERM]
+    # There is no run yet: one could not go on with it.
+    assert capsys.readouterr().err == "\nstopped by SIGTERM; nothing was written yet, start it again\n"
 
 
 def test_a_full_disk_is_one_sentence_and_the_last_checkpoint_is_good(whole: Path, tmp_path: Path) -> None:

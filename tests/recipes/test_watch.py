@@ -50,7 +50,7 @@ def test_the_designs_that_are_asked_for(design: str, run: int | None, expected: 
     ("design", "run", "sentence"),
     [
         ("worst", None, r"--design is 'worst': choose best, top5, all or one of .* \[1, 2, 3, 4, 5, 6\]"),
-        ("3", 1, "--design is '3'"),
+        ("3", 1, r"--design is '3': .* of run 1, \[1, 2, 4, 5, 6\]"),  # the third has no return
         ("best", 2, "no design of run 2 in runs/a has a return yet"),
     ],
 )
