@@ -7,8 +7,8 @@ from copy import deepcopy
 
 import pytest
 import torch
-from conftest import ToyEnv
 from tensordict import TensorDict
+from toy_env import ToyEnv
 
 from coim import DynamicsLearner, EnsembleNLLLoss, GaussianEnsemble, select_run
 

@@ -7,9 +7,9 @@ from copy import deepcopy
 
 import pytest
 import torch
-from conftest import ToyEnv
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
+from toy_env import ToyEnv
 
 from coim import CoImSACLoss, SACLearner, make_policy, make_qvalue, select_run
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from conftest import ToyEnv
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
+from toy_env import ToyEnv
 
 from coim import CoImSACLoss, SACLearner, make_policy, make_qvalue
 from coim.models.policy import LOG_SCALE_RANGE
