@@ -121,7 +121,7 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         best=float("-inf") if trial is None else float(trial.best[trial.best.isfinite()].mean().nan_to_num(-torch.inf)),
         quiet=settings.quiet,
     )
-    log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb)
+    log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb, quiet=settings.quiet)
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)

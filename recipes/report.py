@@ -22,6 +22,7 @@ from recipes.reporting import diagnostics, figures
 from recipes.reporting.figures import Picture
 from recipes.reporting.page import FONT, image, note, page, section, table
 from recipes.reporting.records import Record, Row, number, read_records
+from recipes.writing import write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,7 +70,7 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
         sections = [in_short(records), *(show(picture) for picture in pictures_of(records, body)), *in_full(records)]
     path.parent.mkdir(parents=True, exist_ok=True)
     title = f"{records[0].environment}: {', '.join(record.name for record in records)}"
-    path.write_text(page(title, sections), encoding="utf-8")
+    write_whole(path, page(title, sections))
     return path
 
 

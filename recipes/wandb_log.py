@@ -32,10 +32,13 @@ class WandbLog:
         folder: of the run.
         environment: name of the body, for the project.
         mode: online needs an account and a network, offline neither.
+        quiet: whether W&B says nothing of its own on the terminal.
     """
 
-    def __init__(self, folder: Path, environment: str, mode: Literal["offline", "online"]) -> None:
-        self._folder, self._environment = folder, environment
+    def __init__(
+        self, folder: Path, environment: str, mode: Literal["offline", "online"], *, quiet: bool = False
+    ) -> None:
+        self._folder, self._environment, self._quiet = folder, environment, quiet
         try:
             logger = self._open(offline=mode == "offline")
         except Exception as error:  # W&B's own kinds have no common name
@@ -70,6 +73,7 @@ class WandbLog:
                 id=config.get("wandb_id"),  # and resume="allow", which is TorchRL's default
                 project=f"coim-{self._environment}",
                 config=config,
+                settings={"silent": self._quiet},
             )
 
     def _work(self, logger: WandbLogger) -> None:
