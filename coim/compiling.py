@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 
@@ -21,7 +21,7 @@ _COMPILING = threading.Lock()
 
 
 def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
-    """Compile a function on its first call; later calls of the same shapes and dtypes take what was compiled then.
+    """Compile a function on its first call.
 
     Args:
         function: of tensors, without side effects and without branches on their values.
@@ -29,11 +29,17 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
 
     Returns:
         A function with the same results up to rounding. It may be called by several threads; whoever calls first
-        compiles, the others wait.
+        compiles, the others wait. Later calls must have the shapes and dtypes of the first.
+
+    Raises:
+        RuntimeError: by the returned function, if a call has other shapes; torch names the tensor.
 
     Note:
         Compiling takes seconds to a minute and needs a C++ compiler. Nothing falls back to the plain function: what
         cannot be compiled raises torch's own error.
+
+        What is called afterwards is the compiled code itself. `torch.compile` would look for it anew in every call,
+        by a hook in the interpreter that torch 2.13 now and then forgets to set where two threads call at once.
 
     Example:
         >>> import torch
@@ -41,16 +47,15 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
         >>> quick(torch.zeros(2))
         tensor([0., 0.])
     """
-    quick = torch.compile(function, fullgraph=True, dynamic=False, options={"cpp_wrapper": device.type == "cpu"})
-    ready = threading.Event()
+    slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options={"cpp_wrapper": device.type == "cpu"})
+    quick: list[Callable[P, R]] = []
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if ready.is_set():
-            return quick(*args, **kwargs)
-        with _COMPILING:
-            result = quick(*args, **kwargs)
-            ready.set()
-        return result
+        if not quick:
+            with _COMPILING:
+                if not quick:
+                    quick.append(slow.aot_compile((args, kwargs)))
+        return quick[0](*args, **kwargs)
 
     return call

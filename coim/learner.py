@@ -60,7 +60,8 @@ class SACLearner:
             policy and critics scale their inputs differently.
 
     Note:
-        On CUDA an update is captured once as a CUDA graph and replayed: all batches must have one size there.
+        On CUDA an update is captured once as a CUDA graph and replayed: all batches must have one size there, and
+        wherever the gradients are compiled.
 
         Moving the modules to another device or dtype afterwards would part them from the flat buffers.
 
