@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-import torch
 from tensordict import TensorDict
 from toy_env import ToyEnv, random_rows
-
-# Threads that wait for each other inside of tiny products collapse when another process wants the same cores.
-torch.set_num_threads(1)
 
 
 @pytest.fixture
