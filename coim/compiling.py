@@ -38,8 +38,9 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
         Compiling takes seconds to a minute and needs a C++ compiler. Nothing falls back to the plain function: what
         cannot be compiled raises torch's own error.
 
-        What is called afterwards is the compiled code itself. `torch.compile` would look for it anew in every call,
-        by a hook in the interpreter that torch 2.13 now and then forgets to set where two threads call at once.
+        What is called afterwards is the compiled code itself. `torch.compile` looks for it anew in every call, by a
+        hook in the interpreter; in torch 2.13 that failed once ("found no compiled frames") in a run whose learners
+        called from two threads. Why is not known, and no test has brought it back.
 
     Example:
         >>> import torch
