@@ -5,8 +5,9 @@ from __future__ import annotations
 import random
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints
-from recipes.interrupt import Stopped, end_soon, locked, says_read_only, stopping_at_once
+from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.progress import Progress
 from recipes.report import write_report
@@ -47,31 +48,46 @@ SIMULATED_ROWS = 250  # bodies that the simulator sets up and steps at once wher
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
     """Command line of one environment's recipe."""
     program, description = f"python -m recipes.{name}", f"Co-adapt {body.__name__}: body and controller together."
-    try:
+    with on_command_line(own_process=arguments is None):
         run(body, name, parse(program, description, arguments))
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
-    except SystemExit as leaving:
-        if arguments is None and isinstance(leaving.__context__, Stopped):
-            end_soon(leaving.__context__.signum)
-        raise
-    except KeyboardInterrupt:  # before there was a run to go on with, or when it was over
-        sys.exit(130)
 
 
 def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
-    """Train, and leave a folder with the settings, the numbers and a picture.
+    """Train, and leave a folder with the settings, the numbers and a picture; see `train`."""
+
+    def make(folder: Path, threads: int, side_by_side: bool) -> CoAdaptation:
+        return build(body, settings, threads=threads, side_by_side=side_by_side)
+
+    return train(body, name, settings, make, again=f"python -m recipes.{name} --resume")
+
+
+def train(
+    body: type[MorphEnv],
+    name: str,
+    settings: Settings,
+    make: Callable[[Path, int, bool], Any],
+    *,
+    again: str,
+    finish: Callable[[Any, Path], None] | None = None,
+) -> Path:
+    """Follow Algorithm 1 in a folder of its own, which can be gone on with after any end.
 
     Args:
         body: the environment.
         name: of the environment, the first part of the folder's name.
         settings: everything else; ``resume`` names the folder of a run to go on with.
+        make: a `CoAdaptation`, or what can stand for one, from its folder, its threads and whether its learners go
+            side by side.
+        again: the line that goes on with a run, but for its folder.
+        finish: what is left to do with an algorithm that is through.
 
     Returns:
         The folder.
 
     Raises:
-        SystemExit: on Ctrl-C or SIGTERM, after the line that resumes the run.
+        ValueError: if settings contradict each other, the folder or this machine.
+        OSError: if the folder cannot be written to.
+        SystemExit: on Ctrl-C or SIGTERM, after the line that goes on with the run.
     """
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
@@ -82,16 +98,18 @@ def run(body: type[MorphEnv], name: str, settings: Settings) -> Path:
         check_origin(folder, name)
     if settings.compile:
         check_compiler()
-    algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
+    algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
         how = "compiled in the first episode" if settings.compile else "not compiled"
         print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how} -> {folder}")
-    again = f"to go on: python -m recipes.{name} --resume {folder}"
+    again = f"to go on: {again} {folder}"
     with locked(folder):
         try:
             with stopping_at_once():
                 follow(algorithm, folder, name, settings)
+                if finish is not None:
+                    finish(algorithm, folder)
         except Stopped as stop:
             begun = (folder / "config.json").is_file()
             print(f"\n{stop}; {again if begun else 'nothing was written yet, start it again'}", file=sys.stderr)

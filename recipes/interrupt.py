@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,6 +62,25 @@ def stopping_at_once() -> Iterator[None]:
         for signum, handler in before.items():
             # Who was told to end stays within reach of a second Ctrl-C until the process is gone.
             signal.signal(signum, end if stopped else handler)
+
+
+@contextmanager
+def on_command_line(*, own_process: bool) -> Iterator[None]:
+    """Say in one line what was wrong with the input, and be gone soon after being told to end.
+
+    Args:
+        own_process: whether the process ends with what is done here.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+    except SystemExit as leaving:
+        if own_process and isinstance(leaving.__context__, Stopped):
+            end_soon(leaving.__context__.signum)
+        raise
+    except KeyboardInterrupt:  # before there was a run to go on with, or when it was over
+        sys.exit(130)
 
 
 def end_soon(signum: int) -> None:

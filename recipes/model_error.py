@@ -17,17 +17,15 @@ import torch
 
 from coim import MorphEnv, select_run
 from coim.envs import BODIES
-from recipes.experiment import build, check_origin, follow
-from recipes.interrupt import Stopped, locked, stopping_at_once
-from recipes.machine import available_cores, check_compiler, checked_device, prepare
+from recipes.experiment import build, train
+from recipes.interrupt import on_command_line
+from recipes.machine import checked_device
 from recipes.probing.design_space import FILE, SIDE, design_space
 from recipes.probing.errors import change_variance
 from recipes.probing.probed import ProbedCoAdaptation, other_learner
 from recipes.probing.probes import Probes, joined
-from recipes.report import write_report
-from recipes.reporting.pictures import draw_run
-from recipes.results import default_folder, refuse_filled, write_whole
 from recipes.settings import Settings, parse
+from recipes.writing import write_whole
 
 STATES = 3  # of which Fig. 4(b) is drawn, at random
 
@@ -47,14 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         given = [name for name in given if name in BODIES][:1] or ["hopper"]
         given.append("--help")  # the recipe's settings follow
     asked, rest = own.parse_known_args(given)
-    try:
+    with on_command_line(own_process=arguments is None):
         for name in ("every", "rows"):
             if getattr(asked, name) < 1:
                 raise ValueError(f"--{name} is {getattr(asked, name)}, it must be at least 1")
         settings = parse(f"{own.prog} {asked.environment}", str(__doc__), [*folder_options(asked.out), *rest])
         run(BODIES[asked.environment], asked.environment, settings, every=asked.every, rows=asked.rows)
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 def folder_options(out: Path | None) -> list[str]:
@@ -81,31 +77,16 @@ def run(body: type[MorphEnv], name: str, settings: Settings, *, every: int, rows
         ValueError: if the settings learn no model.
         SystemExit: on Ctrl-C or SIGTERM.
     """
-    threads = settings.threads or available_cores()
-    side_by_side = prepare(threads, checked_device(settings.device))
-    if settings.compile:
-        check_compiler()
-    folder = settings.resume or settings.out or default_folder(name, settings)
-    if settings.resume is None:
-        refuse_filled(folder)
-    else:
-        check_origin(folder, name)
-    probed = probe(body, settings, folder, every=every, rows=rows, threads=threads, side_by_side=side_by_side)
-    again = f"to go on: the same line with --out {folder}"
-    with locked(folder):
-        try:
-            with stopping_at_once():
-                follow(probed, folder, name, settings)
-                note = write_design_space(probed, body, folder)
-        except Stopped as stop:
-            print(f"\n{stop}; {again}", file=sys.stderr)
-            sys.exit(128 + stop.signum)
-        except OSError as error:
-            raise OSError(f"{error}; {again}") from error
-    draw_run(folder, body), write_report([folder], body=body)
-    if not settings.quiet:
-        print(f"{note}\nto draw it: python -m recipes.figures {folder.parent}")
-    return folder
+
+    def make(folder: Path, threads: int, side_by_side: bool) -> ProbedCoAdaptation:
+        return probe(body, settings, folder, every=every, rows=rows, threads=threads, side_by_side=side_by_side)
+
+    def finish(probed: ProbedCoAdaptation, folder: Path) -> None:
+        note = write_design_space(probed, body, folder)
+        if not settings.quiet:
+            print(f"{note}\nto draw it: python -m recipes.figures {folder.parent}")
+
+    return train(body, name, settings, make, again="the same line with --out", finish=finish)
 
 
 def probe(

@@ -29,10 +29,10 @@ from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores
 from recipes.plots.runs import Place, Run, Runs, read_runs
 from recipes.reporting.records import Row
-from recipes.results import write_whole
 from recipes.settings import saved_settings
 from recipes.studies.conduct import Conductor, Resources, ray_running, refuse_lack, take_up
 from recipes.studies.definition import Cell
+from recipes.writing import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,10 @@ import tyro
 
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores
-from recipes.results import write_whole
 from recipes.studies.conduct import RETRIES, Conductor, Resources, ray_running, refuse_lack, take_up
 from recipes.studies.definition import Study, from_json, to_json
 from recipes.studies.named import STUDIES
+from recipes.writing import write_whole
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from recipes.results import write_whole
 from recipes.studies.definition import Cell
+from recipes.writing import write_whole
 
 State = Literal["waiting", "running", "finished", "failed"]
 

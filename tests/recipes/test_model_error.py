@@ -29,8 +29,8 @@ OPTIONS += ["--threads", "1", "--no-compile", "--quiet"]
 def measure(folder: Path, *options: str) -> Path:
     """One line on the command line, without the pictures of an ordinary run."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("recipes.model_error.draw_run", no_picture)
-        patched.setattr("recipes.model_error.write_report", lambda folders, body: folders[0])
+        patched.setattr("recipes.experiment.draw_run", no_picture)
+        patched.setattr("recipes.experiment.write_report", lambda folders, body: folders[0])
         patched.setattr("recipes.model_error.SIDE", 5)
         main(["hopper", *OPTIONS, "--every", "2", "--rows", "5", "--out", str(folder), *options])
     return folder

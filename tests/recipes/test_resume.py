@@ -6,7 +6,7 @@ import json
 import resource
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -17,7 +17,7 @@ import torch
 from interrupted_runs import cut, resume, run
 
 from coim import HopperMorph
-from recipes import soak
+from recipes import model_error, soak
 from recipes.checkpoint import Checkpoints
 from recipes.experiment import main
 from recipes.interrupt import Stopped, end_soon, locked, stopping_at_once
@@ -148,15 +148,23 @@ def test_a_thread_that_is_not_over_does_not_keep_a_stopped_process() -> None:
     assert process.exitcode == 128 + signal.SIGTERM
 
 
+@pytest.mark.parametrize(
+    ("command_line", "words"), [(lambda: main(HopperMorph, "hopper"), []), (model_error.main, ["hopper"])]
+)
 def test_a_command_line_that_was_stopped_ends_soon_and_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, handlers: None
+    command_line: Callable[[], None],
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    handlers: None,
 ) -> None:
     told: list[int] = []
-    monkeypatch.setattr("recipes.experiment.end_soon", told.append)
+    monkeypatch.setattr("recipes.interrupt.end_soon", told.append)
     monkeypatch.setattr("recipes.experiment.follow", lambda *args: signal.raise_signal(signal.SIGTERM))
-    monkeypatch.setattr("sys.argv", ["hopper", "--preset", "quick", "--out", str(tmp_path / "run"), "--quiet"])
+    monkeypatch.setattr("sys.argv", ["program", *words, "--preset", "quick", "--out", str(tmp_path / "run"), "--quiet"])
     with pytest.raises(SystemExit) as stop:
-        main(HopperMorph, "hopper")
+        command_line()
     assert stop.value.code == 128 + signal.SIGTERM
     assert told == [signal.SIGTERM]
     # There is no run yet: one could not go on with it.
