@@ -79,15 +79,20 @@ class Ledger:
 
     def write(self) -> None:
         """Put the file in the place of the old one."""
-        text = io.StringIO()
-        rows = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-        rows.writeheader()
-        rows.writerows(vars(entry) for entry in self.entries.values())
-        write_whole(self.path, text.getvalue())
+        write_whole(self.path, in_csv(self.entries.values()))
 
     def in_state(self, *states: State) -> list[str]:
         """Names of the cells in these states."""
         return [name for name, entry in self.entries.items() if entry.state in states]
+
+
+def in_csv(entries: Iterable[Entry]) -> str:
+    """What stands in a ``ledger.csv``."""
+    text = io.StringIO()
+    rows = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    rows.writeheader()
+    rows.writerows(vars(entry) for entry in entries)
+    return text.getvalue()
 
 
 def read_ledger(path: Path) -> list[Entry]:

@@ -24,6 +24,7 @@ KINDS = ("first", "first", "optimised", "random")
 def write_cell(
     study: Path,
     name: str,
+    /,
     *runs: Sequence[float],
     predicted: Sequence[float | None] = (None, 1.0, 2.0, 3.0),
     diverged: Sequence[int] = (),

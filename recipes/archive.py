@@ -1,0 +1,110 @@
+"""A study in small, to keep beside its figures: ``python -m recipes.archive STUDY_FOLDER TARGET``.
+
+Of every run that is over, its settings and its tables; of the study, its ledger. No checkpoints, no networks, no logs,
+and no paths of the machine that it was made on. ``python -m recipes.figures TARGET`` draws every figure again, and a
+copy of TARGET is a study's folder, in which ``recipes.study`` makes the runs that are missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from recipes.plots.runs import runs_of_folder
+from recipes.settings import read_config
+from recipes.studies.ledger import in_csv, read_ledger
+from recipes.writing import write_whole
+
+OF_STUDY = ("study.json", "retrained/designs.csv")
+LEDGERS = ("ledger.csv", "retrained/ledger.csv")
+RUNS = ("cells", "retrained/cells", "model_error")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Archive:
+    """Keep a study in small."""
+
+    study: tyro.conf.Positional[Path]
+    """Folder of the study."""
+    target: tyro.conf.Positional[Path]
+    """Folder to write to; files of an earlier archive are replaced."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    asked = tyro.cli(Archive, prog="python -m recipes.archive", description=__doc__, args=arguments)
+    try:
+        kept = archive(asked.study, asked.target)
+    except (ValueError, OSError) as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+    print(f"{len(kept)} runs kept in {asked.target}; to draw them: python -m recipes.figures {asked.target}")
+
+
+def archive(study: Path, target: Path) -> list[Path]:
+    """Copy what the figures of a study are drawn from.
+
+    Args:
+        study: its folder.
+        target: folder of the copy.
+
+    Returns:
+        The run folders that were copied, relative to the study's.
+
+    Raises:
+        ValueError: if the folder is no study's, or no run of it is over.
+    """
+    if not (study / "cells").is_dir():
+        raise ValueError(f"{study} is no study's folder: it has no cells/; name a folder that recipes.study wrote")
+    if target.resolve() == study.resolve():
+        raise ValueError(f"{target} is the study's own folder, name another one for its copy")
+    found = sorted(path.parent for part in RUNS for path in (study / part).rglob("config.json"))
+    kept = [folder.relative_to(study) for folder in found if over(folder)]
+    if not kept:
+        raise ValueError(f"no run of {study} is over yet; let the study go on")
+    for name in kept:
+        copy_run(study / name, target / name, name)
+    for name in OF_STUDY:
+        if (study / name).is_file():
+            (target / name).parent.mkdir(exist_ok=True)
+            write_whole(target / name, (study / name).read_bytes())
+    for name in LEDGERS:
+        if (study / name).is_file():
+            (target / name).parent.mkdir(exist_ok=True)
+            write_whole(target / name, only({folder.name for folder in kept}, study / name))
+    return kept
+
+
+def over(folder: Path) -> bool:
+    """Whether nothing more will come into a run's folder."""
+    runs = runs_of_folder(folder, environment="", task="", arm="", seed=0)
+    return bool(runs) and all(run.over for run in runs)
+
+
+def copy_run(folder: Path, target: Path, name: Path) -> None:
+    """The settings and the tables of a run, whose folder is called by its place in the study."""
+    target.mkdir(parents=True, exist_ok=True)
+    config: dict[str, Any] = read_config(folder)
+    config.pop("wandb_id", None)  # of an account
+    config["settings"] |= {"out": name.as_posix(), "resume": None}
+    for resumption in config.get("resumed", []):
+        resumption["changed"].pop("out", None)
+    write_whole(target / "config.json", json.dumps(config, indent=2) + "\n")
+    for table in folder.glob("*.csv"):
+        write_whole(target / table.name, table.read_bytes())
+
+
+def only(kept: set[str], ledger: Path) -> str:
+    """A ledger in which every run waits that was not kept."""
+    rows = read_ledger(ledger)
+    waiting = {"state": "waiting", "tries": 0, "seconds": None, "message": ""}
+    return in_csv(row if row.cell in kept else dataclasses.replace(row, **waiting) for row in rows)
+
+
+if __name__ == "__main__":
+    main()
