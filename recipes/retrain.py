@@ -136,7 +136,7 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
     there = {(line["environment"], line["task"], line["arm"]) for line in lines}
     for arm in asked.arms:
         if arm not in runs.arms:
-            raise ValueError(f"{arm!r} is no arm of {asked.study}; there are {', '.join(runs.arms)}")
+            raise ValueError(f"{arm!r} is no arm of {asked.study}; name some of its own: --arms {' '.join(runs.arms)}")
         for place in runs.places:
             if (*place, arm) not in there:
                 lines += best_designs(runs, place, arm, asked)
