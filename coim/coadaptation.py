@@ -1,7 +1,8 @@
 """Algorithm 1: behaviour, design and dynamics learnt together, one body after the other.
 
-`CoAdaptation` is an iterator over events. It draws nothing, logs nothing and stops when nobody asks for the next event;
-networks, bodies, buffers and searches are passed in.
+`CoAdaptation` is an iterator over events. Its first loop, behaviour and networks, is here, the second one, design, in
+`coim.design_loop`. It draws nothing, logs nothing and stops when nobody asks for the next event; networks, bodies,
+buffers and searches are passed in.
 
 Shapes: U updates, B batch, T steps, K runs, I first designs, D design, S observation.
 
@@ -25,9 +26,9 @@ from torch import Tensor
 from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
 from coim.continuation import Trial, restore, state_of
-from coim.designs import DesignGenerator, DesignSearch, RandomDesigns
-from coim.designs.search import Fitness
-from coim.divergence import Divergence, flat_fitness
+from coim.design_loop import next_trial
+from coim.designs import DesignGenerator, DesignSearch
+from coim.divergence import Divergence
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
@@ -35,8 +36,6 @@ from coim.episode import run_episode
 from coim.events import DesignChosen, DesignDone, EpisodeDone, Event, Kind
 from coim.imagination import imagine
 from coim.learner import SACLearner
-from coim.models.stacked import select_run
-from coim.objectives.design import DesignValue
 
 UPDATES_PER_SAMPLE = 50  # batches drawn in one call: the replay's fixed cost is paid once for all of them
 
@@ -187,7 +186,7 @@ class CoAdaptation:
         diverged = self.divergence.places
         while self.index < self.num_designs and (self.trial is not None or not self.divergence.everywhere):
             if self.trial is None:
-                trial = self.trial = self._next_trial()
+                trial = self.trial = next_trial(self)
                 yield DesignChosen(self.index, trial.kind, trial.design, trial.predicted, dict(diverged))
             trial = self.trial
             if trial.next_episode == 0:
@@ -221,8 +220,6 @@ class CoAdaptation:
 
     def _episodes_of(self, index: int) -> int:
         return self.first_episodes if index < len(self.first_designs) else self.episodes
-
-    # -- the first loop of Algorithm 1: behaviour and networks --------------------------------------------------------
 
     def _run_and_learn(self, kind: Kind, design: Tensor, episode: int) -> EpisodeDone:
         seconds: dict[str, float] = {}
@@ -325,53 +322,6 @@ class CoAdaptation:
                 for key, value in learner.update(batches).items():
                     means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + value.cpu() * (count / updates)
         return means
-
-    # -- the second loop of Algorithm 1: design -----------------------------------------------------------------------
-
-    def _next_trial(self) -> Trial:
-        """The next design; a run that has diverged keeps the body that it has."""
-        kind, design, predicted = self._next_design()
-        frozen = [*self.divergence.places]
-        if frozen:
-            design = design.clone()
-            design[frozen] = self.buffers.ind[0]["design"][frozen]
-            predicted = None if predicted is None else self.divergence.blank(predicted, (self.index, 0))
-        return Trial(kind, design, predicted, best=torch.full(self.env.batch_size, -torch.inf))
-
-    def _next_design(self) -> tuple[Kind, Tensor, Tensor | None]:
-        """First designs in order, then the optimum of Eq. 5 and a random design in turn; see ``bodies``."""
-        runs = self.env.batch_size.numel()
-        since = self.index - len(self.first_designs)
-        if self.bodies == "fixed":
-            design = self.first_designs[0].expand(runs, -1)
-            return "fixed", design, self._predict(design)
-        if since < 0:
-            design = self.first_designs[self.index].expand(runs, -1)
-            return "first", design, self._predict(design)
-        if self.bodies == "search" and since % 2 == 0:
-            found = [self.search.maximise(fitness) for fitness in self._fitness()]
-            return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
-        design = RandomDesigns(self.env.design_spec)(self.first_designs[:1].expand(runs, -1), rng=self.rngs["designs"])
-        return "random", design, self._predict(design)
-
-    def _fitness(self) -> list[Fitness]:
-        """Eq. 5 of each run, over the same draw of start states; a run that has diverged has none to climb."""
-        states = self.buffers.s0.sample(self.num_start_states)
-        policy, qvalue = self.population.policy, self.population.qvalue
-        runs = self.env.batch_size.numel()
-        if runs == 1:
-            return [DesignValue(policy, qvalue, states[:, 0], precision=self.precision)]
-        return [
-            DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k], precision=self.precision)
-            if k not in self.divergence.places
-            else flat_fitness
-            for k in range(runs)
-        ]
-
-    def _predict(self, design: Tensor) -> Tensor | None:
-        if len(self.buffers.s0) == 0:
-            return None
-        return torch.stack([fitness(row.unsqueeze(0))[0] for fitness, row in zip(self._fitness(), design)])
 
 
 def episode_return(rows: TensorDictBase) -> Tensor:

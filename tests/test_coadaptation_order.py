@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from test_coadaptation import STEPS, small
 
-from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation
+from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation, design_loop
 from coim.batches import batch_parts
 
 
@@ -140,7 +140,7 @@ def test_each_run_chooses_its_body_by_the_population_and_its_own_start_states(
             last = learner.qvalue.module.mlp.layers[-1]
             last.weight.zero_()
             last.bias.copy_((sign * worth).view(*last.bias.shape[:-2], 1, 1).expand_as(last.bias))
-    monkeypatch.setattr(coadaptation, "DesignValue", Recorded)
+    monkeypatch.setattr(design_loop, "DesignValue", Recorded)
     chosen = next(events)
     assert isinstance(chosen, DesignChosen)
     assert chosen.kind == "optimised"
