@@ -33,7 +33,7 @@ class Archive:
     study: tyro.conf.Positional[Path]
     """Folder of the study."""
     target: tyro.conf.Positional[Path]
-    """Folder to write to; files of an earlier archive are replaced."""
+    """Folder to write to; what an earlier archive left there is replaced."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -63,10 +63,11 @@ def archive(study: Path, target: Path) -> list[Path]:
         raise ValueError(f"{study} is no study's folder: it has no cells/; name a folder that recipes.study wrote")
     if target.resolve() == study.resolve():
         raise ValueError(f"{target} is the study's own folder, name another one for its copy")
-    found = sorted(path.parent for part in RUNS for path in (study / part).rglob("config.json"))
-    kept = [folder.relative_to(study) for folder in found if over(folder)]
+    kept = [name for name in runs_in(study) if over(study / name)]
     if not kept:
         raise ValueError(f"no run of {study} is over yet; let the study go on")
+    for name in set(runs_in(target)) - set(kept):  # the study was changed since, and they go on
+        remove_run(target / name)
     for name in kept:
         copy_run(study / name, target / name, name)
     for name in OF_STUDY:
@@ -78,6 +79,11 @@ def archive(study: Path, target: Path) -> list[Path]:
             (target / name).parent.mkdir(exist_ok=True)
             write_whole(target / name, only({folder.name for folder in kept}, study / name))
     return kept
+
+
+def runs_in(study: Path) -> list[Path]:
+    """All run folders of a study, relative to its own."""
+    return sorted(path.parent.relative_to(study) for part in RUNS for path in (study / part).rglob("config.json"))
 
 
 def over(folder: Path) -> bool:
@@ -99,11 +105,22 @@ def copy_run(folder: Path, target: Path, name: Path) -> None:
         write_whole(target / table.name, table.read_bytes())
 
 
+def remove_run(folder: Path) -> None:
+    """Take away what `copy_run` has written."""
+    for path in (folder / "config.json", *folder.glob("*.csv")):
+        path.unlink()
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
 def only(kept: set[str], ledger: Path) -> str:
     """A ledger in which every run waits that was not kept."""
-    rows = read_ledger(ledger)
-    waiting = {"state": "waiting", "tries": 0, "seconds": None, "message": ""}
-    return in_csv(row if row.cell in kept else dataclasses.replace(row, **waiting) for row in rows)
+    waiting = {"state": "waiting", "tries": 0, "seconds": None}
+    return in_csv(
+        # Why a cell failed once is told with paths of its machine.
+        dataclasses.replace(row, message="", **{"state": "finished"} if row.cell in kept else waiting)
+        for row in read_ledger(ledger)
+    )
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from recipes.figures import write_figures
 from recipes.settings import plain
 from recipes.studies.conduct import take_up
 from recipes.studies.definition import Study
+from recipes.studies.ledger import Ledger
 from tests.recipes.made_up_study import read_table, write_cell, write_table
 
 STUDY = Study(
@@ -93,7 +94,31 @@ def test_archiving_again_adds_what_was_finished_since(study: Path, tmp_path: Pat
     folder.rename(tmp_path / "old")
     write_cell(study, UNDER_WAY, [4, 5, 6, 7], **settings)
     main([str(study), str(tmp_path / "kept")])
-    assert (tmp_path / "kept" / "cells" / UNDER_WAY / "designs.csv").is_file()
+    rows = read_table(tmp_path / "kept" / "cells" / UNDER_WAY / "designs.csv")
+    assert [float(row["best_return"]) for row in rows] == [4, 5, 6, 7]
+
+
+def test_an_archive_does_not_mix_runs_of_a_study_that_grew_with_those_of_before(study: Path, tmp_path: Path) -> None:
+    main([str(study), str(tmp_path / "kept")])
+    path = study / "cells" / "hopper-forward-none-0" / "config.json"
+    config = json.loads(path.read_text())
+    path.write_text(json.dumps(config | {"settings": config["settings"] | {"num_designs": 6}}))  # two more to try
+    main([str(study), str(tmp_path / "kept")])
+    assert not (tmp_path / "kept" / "cells" / "hopper-forward-none-0").exists()
+    assert (tmp_path / "kept" / "cells" / "hopper-forward-none-1").exists()
+    states = {row["cell"]: row["state"] for row in read_table(tmp_path / "kept" / "ledger.csv")}
+    assert states["hopper-forward-none-0"] == "waiting"
+
+
+def test_a_run_that_is_over_is_finished_whatever_the_ledger_says_and_a_message_is_left_out(
+    study: Path, tmp_path: Path
+) -> None:
+    cells = STUDY.cells()
+    ledger = Ledger(study / "ledger.csv", cells)
+    ledger.note(cells[0].name, "failed", message=f"OSError: {tmp_path} was full")
+    main([str(study), str(tmp_path / "kept")])
+    row = read_table(tmp_path / "kept" / "ledger.csv")[0]
+    assert (row["cell"], row["state"], row["message"]) == (cells[0].name, "finished", "")
 
 
 def test_what_cannot_be_kept_is_told(study: Path, tmp_path: Path) -> None:
