@@ -17,6 +17,7 @@ import matplotlib as mpl
 import tyro
 
 from recipes.plots import cartpole, design_space, model_error, retrained, returns, statistics
+from recipes.plots.intervals import FEW
 from recipes.plots.plot import Plot
 from recipes.reporting.page import FONT
 from recipes.reporting.records import number
@@ -86,7 +87,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
 
 def page(study: Path, plots: Iterable[Plot]) -> str:
     """All figures with their captions, in Markdown."""
-    lines = [f"# Figures of {study.resolve().name}", "", "Written by `python -m recipes.figures`.", ""]
+    lines = [f"# Figures of {study.resolve().name}", "", f"Written by `python -m recipes.figures`. {FEW}", ""]
     for plot in plots:
         lines += [f"## {plot.name}", ""]
         if plot.figure is not None:

@@ -1,4 +1,4 @@
-"""Means over runs with intervals that few runs can carry.
+"""Means over runs with their intervals.
 
 Shapes: R runs.
 
@@ -16,6 +16,10 @@ from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000  # as rliable
+FEW = (  # measured by the tests of this module
+    "A percentile bootstrap of few runs is too narrow: of normally distributed returns, its 95 % interval of the mean "
+    "(of the IQM) holds the truth in 76% (76%) of studies with 3 runs, 84% (92%) with 5 and 90% (94%) with 10."
+)
 SEED = 0  # of the resampling: a figure that is drawn again is the same figure
 
 Statistic = Callable[..., np.ndarray]

@@ -12,7 +12,6 @@ from scipy import stats
 
 from recipes.plots.intervals import holm, improvement, interval, mean
 from recipes.plots.runs import Run, Runs
-from recipes.reporting.figures import rank_correlation
 from recipes.reporting.records import Row
 
 Cells = dict[str, object]
@@ -20,6 +19,8 @@ MEASURES = ("area", "final")
 # Against whom: everybody against the baseline; what imagines unseen bodies against what imagines seen ones; the
 # simulator that imagines random bodies against the model that does.
 BASELINES = {"none": None, "known": ("noisy", "random"), "random": ("oracle",)}
+
+NO_PAIRS: Cells = {"paired_difference_low": math.nan, "paired_difference_high": math.nan}
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,13 @@ class Measured:
         run: whose they are.
         area: under the best-return curve of Fig. 1, over the number of designs: the mean best return of a design.
         final: the highest best return of all designs: what is in hand when the budget is spent.
-        correlation: Spearman's, of the prediction Q(xi) before a body was built and the best return on it.
-        bias: mean of prediction minus best return, both as reward per step; see `per_step`.
+        correlation: Spearman's, of the prediction Q(xi) before a body was built and the best return on it, over the
+            bodies that came after the first ones.
+        correlation_given_order: the same with the order of building held fixed: Q and returns both rise while the
+            networks learn, whatever the body.
+        bias_optimised: mean of prediction minus best return over the designs that maximised Q, both as reward per
+            step; see `predictions`.
+        bias_random: the same over random designs.
         hours: wall-clock of the cell.
         updates: of all learners and the ensemble.
 
@@ -42,7 +48,9 @@ class Measured:
     area: float
     final: float
     correlation: float
-    bias: float
+    correlation_given_order: float
+    bias_optimised: float
+    bias_random: float
     hours: float
     updates: int
 
@@ -50,23 +58,48 @@ class Measured:
 def measure(run: Run, failure: float) -> Measured:
     """A diverged run counts with ``failure`` on each design that it did not reach."""
     values = run.best_returns(failure) if run.over else np.array([math.nan])
-    pairs = predictions(run)
+    chosen = [row for row in predictions(run) if row["kind"] != "first"]
+    if len({row["xi"] for row in chosen}) < 2:
+        chosen = []  # of one body alone there is nothing to rank
     settings, rows = run.record.settings, [row for row in run.record.episodes if row["run"] == run.number]
     an_episode = settings["individual_updates"] + settings["population_updates"]
     learns_model = settings["designs"] != "none" and settings.get("dream") != "simulator"
     an_episode += settings["model_updates"] * learns_model
-    correlation = rank_correlation(pairs)
     return Measured(
         run,
         area=float(values.mean()),
         final=float(values.max()),
-        correlation=math.nan if correlation is None else correlation,
-        bias=float(np.mean([row["predicted_per_step"] - row["return_per_step"] for row in pairs]))
-        if pairs
-        else math.nan,
+        correlation=spearman(chosen, "predicted", "best_return"),
+        correlation_given_order=spearman_given(chosen, "predicted", "best_return", given="design"),
+        bias_optimised=bias([row for row in chosen if row["kind"] == "optimised"]),
+        bias_random=bias([row for row in chosen if row["kind"] == "random"]),
         hours=max(row["seconds"] for row in run.record.episodes) / 3600,
         updates=len(rows) * an_episode,
     )
+
+
+def spearman(rows: Sequence[Row], one: str, other: str) -> float:
+    """Rank correlation of two columns; NaN for less than three rows, or where one of them is the same in all."""
+    x, y = ([row[name] for row in rows] for name in (one, other))
+    if len(rows) < 3 or len(set(x)) == 1 or len(set(y)) == 1:
+        return math.nan
+    return float(stats.spearmanr(x, y).statistic)
+
+
+def spearman_given(rows: Sequence[Row], one: str, other: str, *, given: str) -> float:
+    """Partial rank correlation of two columns with a third one held fixed.
+
+    NaN for less than four rows, or where the third one says all of one of the others.
+    """
+    x_y, x_z, y_z = (spearman(rows, *pair) for pair in ((one, other), (one, given), (other, given)))
+    rest = (1 - x_z**2) * (1 - y_z**2)
+    return (x_y - x_z * y_z) / math.sqrt(rest) if len(rows) > 3 and rest > 1e-12 else math.nan
+
+
+def bias(rows: Sequence[Row]) -> float:
+    """Mean of prediction minus best return, both as reward per step; NaN for no rows."""
+    errors = [row["predicted_per_step"] - row["return_per_step"] for row in rows]
+    return float(np.mean(errors)) if errors else math.nan
 
 
 def predictions(run: Run) -> list[Row]:
@@ -129,7 +162,9 @@ def compare(runs: Runs, measured: Sequence[Measured], name: str, arm: str, again
             | {"improvement": float(improvement(x, y))}
             | limits("improvement", improvement, x, y)
             | {"welch_p": welch(x, y), "welch_p_holm": math.nan}
-            | {"pairs": len(shared), "paired_p": paired(difference), "paired_p_holm": math.nan}
+            | {"pairs": len(shared), "paired_difference": float(difference.mean()) if shared else math.nan}
+            | (limits("paired_difference", mean, difference) if shared else NO_PAIRS)
+            | {"paired_p": paired(difference), "paired_p_holm": math.nan}
         )
     if len(strata) > 2:
         count, count_against = (sum(map(len, strata[side::2])) for side in (0, 1))
@@ -141,7 +176,9 @@ def compare(runs: Runs, measured: Sequence[Measured], name: str, arm: str, again
             | {"improvement": float(improvement(*strata))}
             | limits("improvement", improvement, *strata)
             | {"welch_p": math.nan, "welch_p_holm": math.nan}
-            | {"pairs": 0, "paired_p": math.nan, "paired_p_holm": math.nan}
+            | {"pairs": 0, "paired_difference": math.nan}
+            | NO_PAIRS
+            | {"paired_p": math.nan, "paired_p_holm": math.nan}
         )
 
 

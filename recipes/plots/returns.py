@@ -53,11 +53,17 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
     grid = figure.subplots(len(panels), len(panels[0]), squeeze=False, sharex="col")
     rows: list[dict[str, object]] = []
     first: dict[Place, Axes] = {}  # panels of one place share their limits
-    for axes, (place, label) in zip(grid.flat, (panel for line in panels for panel in line)):
-        if not draw_panel(axes, runs, place, drawn, label, rows):
+    lowest: dict[int, Axes] = {}  # panel with lines of each column
+    for i, (axes, (place, label)) in enumerate(zip(grid.flat, (panel for line in panels for panel in line))):
+        if draw_panel(axes, runs, place, drawn, label, rows):
+            lowest[i % len(panels[0])] = axes
+        else:
             axes.axis("off")
+            axes.text(0.5, 0.5, f"{', '.join(place)}:\nno design is finished yet", ha="center", va="center",
+                      transform=axes.transAxes)  # fmt: skip
         axes.sharey(first.setdefault(place, axes))
-    for axes in grid[-1]:
+    for axes in lowest.values():
+        axes.tick_params(labelbottom=True)
         axes.set(xlabel="design (number)")
     entries = styles.handles(drawn)
     if any(run.diverged for run in runs.found if run.arm in drawn):
@@ -85,10 +91,9 @@ def draw_panel(
         if not own:
             continue
         longest = max(run.num_designs for run in own)
-        values = np.full((len(own), longest), math.nan)
-        for line, run in zip(values, own):
-            line[: run.num_designs] = run.best_returns(failure)
+        for run in own:
             draw_run(axes, run)
+        values = best_returns(own, longest, failure)
         value, low, high, count = over_runs(values, STATISTICS[label])
         x, shown = np.arange(1, longest + 1), count > 0
         axes.plot(x, value, linewidth=1.6, zorder=3, marker="o" if shown.sum() == 1 else "", **styles.style(arm))
@@ -101,10 +106,28 @@ def draw_panel(
             rows.append(head | {"seed": "", "run": "", "design": int(x[i])} | numbers)
         if label == "mean":  # the single runs are the same in both panels
             rows += [row for run in own for row in rows_of(run)]
-    axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design, {label} (1)")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    if axes.lines:
+        axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design, {label} (1)")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.xaxis.get_major_locator().set_params(integer=True)
     return bool(axes.lines)
+
+
+def best_returns(own: Sequence[Run], longest: int, failure: float) -> np.ndarray:
+    """Best returns of the runs of one arm, ``[R, M]``, NaN where they are still to come.
+
+    What a diverged run counts on a design that it did not reach is left out as long as a run under way has not reached
+    that design either: it would be all that the arm has there.
+    """
+    values = np.full((len(own), longest), math.nan)
+    for line, run in zip(values, own):
+        line[: run.num_designs] = run.best_returns(failure)
+    under_way = [run.state == "under way" for run in own]
+    awaited = np.isnan(values[under_way]).any(0)
+    for line, run in zip(values, own):
+        if run.diverged:
+            line[awaited & (np.arange(longest) >= len(run.designs))] = math.nan
+    return values
 
 
 def draw_run(axes: Axes, run: Run) -> None:

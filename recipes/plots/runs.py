@@ -5,16 +5,17 @@ Shapes: M designs.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from recipes.plots.arms import in_order
-from recipes.reporting.records import Record, Row, read_record, read_rows
+from recipes.reporting.records import Record, Row, number, read_record, read_rows
+from recipes.studies.definition import from_json
+from recipes.studies.ledger import read_ledger
 
 Place = tuple[str, str]  # environment and task
 
@@ -31,6 +32,7 @@ class Run:
         number: of the run within the cell, from 0.
         record: the cell's folder, read back.
         diverged: whether it broke down before it had tried all designs.
+        given_up: whether its cell failed again and again.
     """
 
     environment: str
@@ -40,6 +42,7 @@ class Run:
     number: int
     record: Record
     diverged: bool
+    given_up: bool = False
 
     @property
     def num_designs(self) -> int:
@@ -60,7 +63,9 @@ class Run:
     @property
     def state(self) -> str:
         """In a word."""
-        return "diverged" if self.diverged else "finished" if self.over else "under way"
+        if self.over:
+            return "diverged" if self.diverged else "finished"
+        return "failed" if self.given_up else "under way"
 
     def best_returns(self, failure: float) -> np.ndarray:
         """Best return of each design, ``[M]``; NaN where it is still to come.
@@ -81,10 +86,12 @@ class Runs:
     Attributes:
         found: those that have begun.
         planned: number of runs to come or there, by (environment, task, arm).
+        given_up: those of cells that failed again and again.
     """
 
     found: list[Run]
     planned: Counter[tuple[str, str, str]]
+    given_up: Counter[tuple[str, str, str]]
 
     @property
     def places(self) -> list[Place]:
@@ -114,52 +121,68 @@ class Runs:
         return min((row["best_return"] for run in own for row in run.designs), default=math.nan)
 
     def in_words(self, arms: list[str]) -> str:
-        """How many of how many runs are over, and how many of them diverged, in a sentence."""
+        """How many of how many runs are over, and what is to be known of those that are not, or diverged."""
         own = [run for run in self.found if run.arm in arms]
-        over, diverged = sum(run.over for run in own), sum(run.diverged for run in own)
-        planned = sum(count for (_, _, arm), count in self.planned.items() if arm in arms)
+        states = Counter(run.state for run in own)
+        over, diverged, under_way = states["finished"] + states["diverged"], states["diverged"], states["under way"]
+        planned, given_up = (
+            sum(count for (_, _, arm), count in counts.items() if arm in arms)
+            for counts in (self.planned, self.given_up)
+        )
         if over == planned:
             words = f"All {planned} runs are over"
         else:
-            words = f"{over} of {planned} runs are over, {len(own) - over} under way, {planned - len(own)} to come"
-        if not diverged:
-            return f"{words}; none diverged."
-        return (
-            f"{words}; {diverged} of them diverged and count, on each design that they did not reach, with the lowest "
-            "best return that any run of the environment and task has on a design."
+            words = f"{over} of {planned} runs are over, {under_way} under way, "
+            words += f"{planned - over - under_way - given_up} to come"
+            words += f", {given_up} failed (ledger.csv says why)" * bool(given_up)
+        lengths = sorted({run.num_designs for run in own})
+        longer = f" They are to try different numbers of designs: {', '.join(map(str, lengths))}." * (len(lengths) > 1)
+        return f"{words}; {self._diverged_in_words(own, under_way) if diverged else 'none diverged'}.{longer}"
+
+    def _diverged_in_words(self, own: list[Run], under_way: int) -> str:
+        """What diverging means, and what it does to the numbers."""
+        broken = [run for run in own if run.diverged]
+        places = dict.fromkeys((run.environment, run.task) for run in broken)
+        values = "; ".join(f"{', '.join(place)}: {number(self.failure(place))}" for place in places)
+        words = (
+            f"{len(broken)} of them diverged (a loss, weight or moment became no finite number, or a weight huge) "
+            "and count, on each design that they did not reach, with the lowest best return that any run of the "
+            f"environment and task has on a design ({values}), on which the means and Welch's test depend"
         )
+        if under_way:
+            words += "; they are over before the others, so until all are over their arm looks worse than it is"
+        return words
 
 
 def read_runs(study: Path) -> Runs:
     """Read a study's folder, in any state of it.
 
     Raises:
-        ValueError: if it is none, or a cell's folder cannot be read.
+        ValueError: if it is none, or its ``study.json`` or a cell's folder cannot be read.
     """
     cells = study / "cells"
     if not cells.is_dir():
         raise ValueError(f"{study} is no study's folder: it has no cells/; name a folder that recipes.study wrote")
-    names = cells_of_ledger(study / "ledger.csv")
-    names += sorted(path.name for path in cells.iterdir() if path.is_dir())
+    ledger = {entry.cell: entry.state for entry in read_ledger(study / "ledger.csv")}
+    names = [*ledger, *sorted(path.name for path in cells.iterdir() if path.is_dir())]
     found: list[Run] = []
-    sizes: dict[tuple[str, str, str, int], int] = {}  # runs of each cell, 0 while it has not said so
-    for name in dict.fromkeys(names):
-        own = runs_of_cell(cells / name)
-        found += own
-        sizes[parts_of(name)] = own[0].record.settings["num_runs"] if own else 0
-    usual = max(sizes.values(), default=0) or 1
     planned: Counter[tuple[str, str, str]] = Counter()
-    for (*which, _), size in sizes.items():
-        planned[tuple(which)] += size or usual
-    return Runs(found, planned)
+    given_up: Counter[tuple[str, str, str]] = Counter()
+    sizes = sizes_of_cells(study / "study.json")
+    for name in dict.fromkeys(names):
+        failed = ledger.get(name) == "failed"
+        own = [replace(run, given_up=failed) for run in runs_of_cell(cells / name)]
+        found += own
+        *which, _ = parts_of(name)
+        size = own[0].record.settings["num_runs"] if own else sizes.get(name, 1)
+        planned[tuple(which)] += size
+        given_up[tuple(which)] += size * failed
+    return Runs(found, planned, given_up)
 
 
-def cells_of_ledger(path: Path) -> list[str]:
-    """Names of all cells that are planned; none where there is no ledger."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return [row["cell"] for row in csv.DictReader(file)]
+def sizes_of_cells(path: Path) -> dict[str, int]:
+    """Runs of each cell that a study has by its ``study.json``; empty where there is none."""
+    return {cell.name: cell.settings.num_runs for cell in from_json(path).cells()} if path.is_file() else {}
 
 
 def runs_of_cell(folder: Path) -> list[Run]:

@@ -20,6 +20,7 @@ from recipes.reporting.palette import BLACK, GREY, put_legend
 
 LABELS = {"area": "area: mean best return of a design (1)", "final": "final: highest best return (1)"}
 ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not"
+PREDICTING = ("rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
 INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
 
 
@@ -52,8 +53,11 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
         "Runs that have tried all their designs, or diverged: points. Bars: interquartile means (IQM) and their "
         f"intervals; ticks: means. {INTERVALS}area: the mean over designs of a design's best return; final: the "
         "highest of all designs. rank_correlation: Spearman's, of Q(xi) before a body was built and the best return on "
-        "it, mean over runs. bias: (1 - gamma) Q(xi) - best return / steps, both a reward per step, equal if the "
-        f"reward is constant; {ENTROPY}. hours: wall-clock of a run's cell; hours and updates: mean over runs. "
+        "it, over the bodies after the first ones, mean over runs; _given_order: the partial one with the order of "
+        "building held fixed, as Q and returns both rise while the networks learn. bias: (1 - gamma) Q(xi) - best "
+        "return / steps, both a reward per step, equal if the reward is constant, of bodies that maximised Q and of "
+        f"the random ones; {ENTROPY}. diverged_share: of the runs that have begun. hours: wall-clock of a run's cell; "
+        "hours and updates: mean over runs. "
         f"{runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_arms", figure=figure, rows=rows, caption=caption, readable=True)
@@ -64,13 +68,13 @@ def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cell
     over = [m for m in own if m.run.over]
     diverged = sum(m.run.diverged for m in own)
     row: Cells = {"environment": place[0], "task": place[1], "arm": arm, "planned": runs.planned[*place, arm]}
-    row |= {"over": len(over), "diverged": diverged, "diverged_share": diverged / len(over) if over else np.nan}
+    row |= {"over": len(over), "diverged": diverged, "diverged_share": diverged / len(own) if own else np.nan}
     for name in MEASURES:
         values = np.array([getattr(m, name) for m in over])
         row |= {f"{name}_mean": float(mean(values)) if over else np.nan}
         row |= {f"{name}_iqm": float(iqm(values)) if over else np.nan} | limits(f"{name}_iqm", iqm, values)
-    for name, attribute in (("rank_correlation", "correlation"), ("bias", "bias")):
-        values = np.array([getattr(m, attribute) for m in over])
+    for name in PREDICTING:
+        values = np.array([getattr(m, name.removeprefix("rank_")) for m in over])
         values = values[np.isfinite(values)]
         row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
     for name in ("hours", "updates"):
@@ -120,10 +124,12 @@ def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
         axes.tick_params(axis="y", labelsize=7)
     caption = (
         "Probability that a run of one arm ends above a run of the other, ties counting half, by the area under the "
-        f"best-return curve and by the highest best return. {INTERVALS}Over all environments and tasks each counts "
-        "alike and is resampled by itself. welch_p: Welch's t-test, two-sided; paired_p: paired t-test of runs that "
-        "share their seed and first designs (with five pairs Wilcoxon's test cannot go below 0.0625); _holm: corrected "
-        f"by Holm over all tests of that kind by that measure in this table. {runs.in_words(runs.arms)}"
+        f"best-return curve and by the highest best return; 1 means that no run of the other was above one of it, "
+        f"which few runs often show by chance. {INTERVALS}all: the mean over the environments and tasks in which both "
+        "arms have runs, each resampled by itself. difference and welch_p: of the arms, Welch's t-test, two-sided; "
+        "paired_difference and paired_p: of the runs that share their seed, paired t-test (with five pairs Wilcoxon's "
+        "test cannot go below 0.0625); _holm: corrected by Holm over all tests of that kind by that measure in this "
+        f"table. {runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_pairs", figure=figure, rows=rows, caption=caption, readable=True)
 
@@ -165,6 +171,16 @@ def predicted(runs: Runs) -> Plot:
     return Plot(name="statistics_predictions", figure=figure, rows=rows, caption=caption)
 
 
+OF_RUN = (
+    "area",
+    "final",
+    "correlation",
+    "correlation_given_order",
+    "bias_optimised",
+    "bias_random",
+    "hours",
+    "updates",
+)
 PREDICTED = ("design", "kind", "predicted", "best_return", "predicted_per_step", "return_per_step")
 
 
@@ -175,7 +191,7 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
     rows: list[Cells] = [
         {"environment": m.run.environment, "task": m.run.task, "arm": m.run.arm, "seed": m.run.seed}
         | {"run": m.run.number, "state": m.run.state, "designs": len(m.run.designs), "planned": m.run.num_designs}
-        | {name: getattr(m, name) for name in ("area", "final", "correlation", "bias", "hours", "updates")}
+        | {name: getattr(m, name) for name in OF_RUN}
         for m in measured
     ]
     places = [place for place in runs.places if any((m.run.environment, m.run.task) == place for m in measured)]

@@ -58,7 +58,7 @@ class Ledger:
             cell.name: Entry(cell.name, cell.environment, cell.settings.task, cell.arm, cell.settings.seed)
             for cell in cells
         }
-        for row in read_ledger(path) if path.exists() else []:
+        for row in read_ledger(path):
             if row.cell not in self.entries:
                 raise ValueError(f"{path} has the cell {row.cell}, which this study has not; take another folder")
             state: State = "finished" if row.state == "finished" else "waiting"
@@ -96,7 +96,9 @@ def in_csv(entries: Iterable[Entry]) -> str:
 
 
 def read_ledger(path: Path) -> list[Entry]:
-    """The rows of a ``ledger.csv``."""
+    """The rows of a ``ledger.csv``; none where there is no such file."""
+    if not path.is_file():
+        return []
     with path.open(newline="") as file:
         return [
             Entry(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from recipes.plots.runs import parts_of
+from recipes.studies.ledger import Entry, State, in_csv
 
 SETTINGS = {
     "num_designs": 4,
@@ -58,6 +61,15 @@ def write_cell(
     write_table(folder / "evaluations.csv", COLUMNS, episodes)
     write_table(folder / "designs.csv", [*COLUMNS[:5], "predicted", "best_return", "diverged"], designs)
     return folder
+
+
+def write_ledger(study: Path, states: Mapping[str, State]) -> None:
+    """The ledger of a study: the state of each cell by its name."""
+    rows = []
+    for name, state in states.items():
+        environment, task, arm, seed = parts_of(name)
+        rows.append(Entry(name, environment, task, arm, seed, state))
+    (study / "ledger.csv").write_text(in_csv(rows))
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -6,12 +6,13 @@ import math
 from pathlib import Path
 
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.image import imread
 
 from recipes.figures import main, write_figures
 from recipes.plots import returns, statistics
 from recipes.plots.plot import Plot
-from tests.recipes.made_up_study import read_table, write_cell, write_table
+from tests.recipes.made_up_study import read_table, write_cell, write_ledger, write_table
 
 DRAWN = ["figure_1_best_returns", "figure_3_best_returns", "statistics_arms", "statistics_pairs"]
 DRAWN += ["statistics_predictions", "statistics_runs"]
@@ -50,29 +51,33 @@ def test_the_csv_of_figure_1_holds_mean_iqm_interval_and_each_run(study: Path) -
     value = {(row["arm"], row["series"], row["design"]): row for row in rows if row["series"] != "run"}
     assert float(value["none", "mean", "4"]["best_return"]) == 4
     assert float(value["none", "IQM", "4"]["best_return"]) == 3  # of 1, 2, 4, 9 the middle two
-    assert [value["none", "mean", "4"][end] for end in ("low", "high")] != ["", ""]
+    low, high = (float(value["none", "mean", "4"][end]) for end in ("low", "high"))
+    assert 1 < low < 4 < high < 9
     assert float(value["known", "mean", "2"]["best_return"]) == (22 + 24 + 14) / 3
     assert value["known", "mean", "3"]["runs"] == "3"
     assert float(value["known", "mean", "3"]["best_return"]) == pytest.approx((32 + 1 + 40) / 3)  # diverged counts as 1
-    assert value["known", "mean", "4"]["runs"] == "2"  # the run under way has no fourth design yet
+    # The run under way has no fourth design yet: what the diverged one counts there waits for it.
+    assert (value["known", "mean", "4"]["runs"], float(value["known", "mean", "4"]["best_return"])) == ("1", 42)
     single = [row for row in rows if (row["arm"], row["series"], row["seed"]) == ("known", "run", "1")]
     assert [float(row["best_return"]) for row in single] == [14, 24]
 
 
 def test_the_table_of_arms_counts_planned_and_diverged_runs(study: Path) -> None:
     names = [f"hopper-forward-{arm}-{seed}" for arm in ("none", "known") for seed in range(5)]
-    write_table(study / "ledger.csv", ["cell"], [[name] for name in names])
+    write_ledger(study, dict.fromkeys(names, "waiting"))
     write_figures(study)
     none, known = read_table(study / "figures" / "statistics_arms.csv")
     assert [known[key] for key in ("arm", "planned", "over", "diverged", "diverged_share")] == [
-        "known", "5", "2", "1", "0.5",
+        "known", "5", "2", "1", "0.3333333",
     ]  # fmt: skip
     assert float(known["final_mean"]) == (42 + 24) / 2
-    assert float(known["bias"]) == pytest.approx((-3.0 - 2.3) / 2)  # of the runs that are over, as all in the row
+    assert float(known["bias_random"]) == pytest.approx(0.3 - 4.2)  # of runs that are over, as all in the row
+    assert [float(none[key]) for key in ("final_iqm_low", "final_iqm_high")] == [30, 30]
+    assert float(none["area_iqm_low"]) < float(none["area_iqm"]) < float(none["area_iqm_high"])
     assert float(known["area_mean"]) == pytest.approx((27 + (14 + 24 + 1 + 1) / 4) / 2)
     assert (none["over"], float(none["final_iqm"])) == ("4", 30)
     text = (study / "figures" / "statistics_arms.md").read_text()
-    assert "| hopper | forward | known | 5 | 2 | 1 | 0.5 |" in text
+    assert "| hopper | forward | known | 5 | 2 | 1 | 0.333 |" in text
     assert "nan" not in text
     assert "6 of 10 runs are over, 1 under way, 3 to come" in text
 
@@ -107,6 +112,59 @@ def test_several_environments_and_tasks_stand_in_one_figure(study: Path) -> None
     lone = [row["low"] for row in wide.rows if row["environment"] == "walker" and row["series"] != "run"]
     assert all(math.isnan(float(str(low))) for low in lone)  # one run has no interval
     assert [row["environment"] for row in plots["statistics_pairs"].rows].count("all") == 2
+
+
+def test_the_band_of_figure_1_and_the_bars_of_the_arms_are_those_of_the_csv(study: Path) -> None:
+    plots = drawn(study)
+    rows = plots["figure_1_best_returns"].rows
+    none = [row for row in rows if (row["arm"], row["series"]) == ("none", "mean")]
+    axes = plots["figure_1_best_returns"].figure.axes[0]
+    (line,) = (line for line in axes.lines if line.get_linewidth() == 1.6 and line.get_linestyle() == "-")
+    assert line.get_ydata().tolist() == [row["best_return"] for row in none]
+    band = axes.collections[1 if axes.collections[0].get_facecolor()[0][2] < 0.5 else 0].get_paths()[0].vertices
+    for row in none:
+        at = band[band[:, 0] == row["design"]][:, 1]
+        assert {row["low"], row["high"]} <= {*at}
+    arms = {row["arm"]: row for row in plots["statistics_arms"].rows}
+    axes = plots["statistics_arms"].figure.axes[0]
+    bars = [path.get_segments()[0] for path in axes.collections if isinstance(path, LineCollection)]
+    upright = {round(bar[0][0]): (bar[0][1], bar[1][1]) for bar in bars if bar[0][0] == bar[1][0]}
+    for x, arm in enumerate(("none", "known")):
+        assert upright[x] == (arms[arm]["area_iqm_low"], arms[arm]["area_iqm_high"])
+
+
+def test_each_point_of_the_pairs_stands_beside_the_name_of_its_pair(study: Path) -> None:
+    write_cell(study, "hopper-forward-oracle-0", [90, 90, 90, 90])
+    write_cell(study, "hopper-forward-oracle-1", [90, 90, 90, 90])
+    plot = drawn(study)["statistics_pairs"]
+    expected = {f"{row['arm']} over {row['against']}": row for row in plot.rows if row["measure"] == "area"}
+    axes = plot.figure.axes[0]
+    labels = [label.get_text().splitlines()[0] for label in axes.get_yticklabels()]
+    assert sorted(labels) == sorted(expected)
+    points = {line.get_ydata()[0]: line for line in axes.lines if line.get_marker() != "None"}
+    bars = {
+        line.get_ydata()[0]: line for line in axes.lines if line.get_marker() == "None" and line.get_linestyle() == "-"
+    }
+    for y, label in enumerate(labels):
+        row = expected[label]
+        assert points[y].get_xdata() == [row["improvement"]]
+        assert list(bars[y].get_xdata()) == [row["improvement_low"], row["improvement_high"]]
+    assert expected["oracle over none"]["improvement"] == 1
+    assert expected["known over none"]["improvement"] < 1
+
+
+def test_a_panel_without_a_run_says_so_and_the_one_above_has_the_numbers(study: Path) -> None:
+    write_cell(study, "half_cheetah-forward-none-0", [1, 2, 3, 4])
+    write_cell(study, "half_cheetah-backward-none-0", [1, 2, 3, 4])
+    write_ledger(study, {"hopper-forward-none-0": "waiting", "hopper-backward-none-0": "waiting"})
+    figure = drawn(study)["figure_1_best_returns"].figure
+    titles = [axes.get_title() for axes in figure.axes]
+    empty = [axes for axes in figure.axes if not axes.get_title()]
+    assert "hopper, backward" not in titles
+    assert {axes.texts[0].get_text() for axes in empty} == {"hopper, backward:\nno design is finished yet"}
+    lowest = [axes for axes in figure.axes if axes.get_xlabel()]
+    assert {axes.get_title() for axes in lowest} == {"hopper, forward", "half_cheetah, backward"}
+    assert all(axes.xaxis.get_tick_params()["labelbottom"] for axes in lowest)
 
 
 def drawn(study: Path) -> dict[str, Plot]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from recipes.plots.intervals import holm, improvement, interval, iqm, mean, over_runs
+from recipes.plots.intervals import FEW, holm, improvement, interval, iqm, mean, over_runs
 
 
 def test_the_interquartile_mean_weighs_the_values_at_the_quartiles_in_part() -> None:
@@ -56,6 +56,18 @@ def test_improvement_is_mann_whitneys_u_over_the_pairs() -> None:
     assert improvement(x, y) == pytest.approx(stats.mannwhitneyu(x, y).statistic / 15)
     assert improvement(x, y) == pytest.approx(1 - improvement(y, x))
     assert improvement(x, x) == 0.5
+
+
+@pytest.mark.parametrize(("runs", "of_the_mean", "of_the_iqm"), [(3, 0.76, 0.76), (5, 0.84, 0.92), (10, 0.90, 0.94)])
+def test_intervals_of_few_runs_hold_the_truth_as_often_as_is_said(
+    runs: int, of_the_mean: float, of_the_iqm: float
+) -> None:
+    studies = np.random.default_rng(0).normal(size=(runs, 1000))  # a column each
+    for statistic, expected in ((mean, of_the_mean), (iqm, of_the_iqm)):
+        low, high = interval(statistic, studies)
+        assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(expected, abs=0.03)  # 2.5 standard errors
+    assert f"{of_the_mean:.0%}" in FEW
+    assert f"{of_the_iqm:.0%}" in FEW
 
 
 def test_strata_count_alike_however_many_runs_they_have() -> None:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from recipes.plots.measures import comparisons, measure, paired, pairs_of_arms, welch
+from recipes.plots.measures import comparisons, measure, paired, pairs_of_arms, spearman, spearman_given, welch
 from recipes.plots.runs import parts_of, read_runs
-from tests.recipes.made_up_study import write_cell, write_table
+from recipes.reporting.records import Row
+from recipes.studies.definition import Study, to_json
+from tests.recipes.made_up_study import read_table, write_cell, write_ledger, write_table
 
 
 def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> None:
@@ -19,11 +21,48 @@ def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> 
     (run,) = read_runs(tmp_path).found
     found = measure(run, failure=-100)
     assert (run.state, found.area, found.final) == ("finished", 25, 40)
-    assert found.correlation == pytest.approx(stats.spearmanr([1, 2, 3], [40, 20, 30]).statistic)
-    # (1 - .9) Q against best return / 10 steps: .1 - 4, .2 - 2, .3 - 3
-    assert found.bias == pytest.approx((-3.9 - 1.8 - 2.7) / 3)
+    # (1 - .9) Q against best return / 10 steps, of design 3, which was searched for, and 4, which was drawn
+    assert found.bias_optimised == pytest.approx(0.2 - 2)
+    assert found.bias_random == pytest.approx(0.3 - 3)
     assert found.hours == pytest.approx(8 * 36 / 3600)
     assert found.updates == 8 * (5 + 3 + 2)
+
+
+def rows_of(*lines: tuple[int, float, float]) -> list[Row]:
+    return [{"design": design, "predicted": q, "best_return": best} for design, q, best in lines]
+
+
+def test_what_only_rises_with_the_order_of_building_correlates_but_not_given_the_order() -> None:
+    learning = rows_of((6, 1.0, 20), (7, 2.0, 10), (8, 4.0, 30), (9, 3.0, 50), (10, 5.0, 40), (11, 6.0, 60))
+    q, best, order = ([row[key] for row in learning] for key in ("predicted", "best_return", "design"))
+    assert spearman(learning, "predicted", "best_return") == pytest.approx(stats.spearmanr(q, best).statistic)
+    # Independently: the correlation of what the order leaves of both ranks.
+    ranks = [stats.rankdata(values) for values in (q, best, order)]
+    left = [r - np.polyval(np.polyfit(ranks[2], r, 1), ranks[2]) for r in ranks[:2]]
+    given = spearman_given(learning, "predicted", "best_return", given="design")
+    assert given == pytest.approx(stats.pearsonr(*left).statistic)
+    assert given < 0 < spearman(learning, "predicted", "best_return")
+
+
+def test_a_correlation_that_says_nothing_is_none() -> None:
+    rising = rows_of((6, 1.0, 10), (7, 2.0, 20), (8, 3.0, 15), (9, 4.0, 30))
+    assert math.isnan(spearman(rising[:2], "predicted", "best_return"))
+    assert math.isnan(spearman_given(rising, "predicted", "best_return", given="design"))  # Q is the order
+    assert math.isnan(spearman(rows_of((6, 1.0, 3), (7, 1.0, 4), (8, 1.0, 5)), "predicted", "best_return"))
+
+
+def test_first_designs_and_a_body_that_never_changes_say_nothing_of_the_ranking(tmp_path: Path) -> None:
+    folder = write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], predicted=(None, 90.0, 2.0, 3.0))
+    (run,) = read_runs(tmp_path).found
+    assert measure(run, failure=0).bias_random == pytest.approx(0.3 - 3)  # and Q = 90 of a first design counts nowhere
+    for name in ("evaluations.csv", "designs.csv"):
+        rows = read_table(folder / name)
+        fixed = [row | {"kind": "fixed", "xi_1": "0.5"} for row in rows]
+        write_table(folder / name, list(fixed[0]), [list(row.values()) for row in fixed])
+    (run,) = read_runs(tmp_path).found
+    found = measure(run, failure=0)
+    for value in (found.correlation, found.correlation_given_order, found.bias_optimised, found.bias_random):
+        assert math.isnan(value)
 
 
 def test_who_learns_no_model_has_no_updates_of_it(tmp_path: Path) -> None:
@@ -61,13 +100,45 @@ def test_a_run_under_way_has_no_area_yet_and_its_last_design_no_best_return(tmp_
 def test_each_run_of_a_fleet_counts_and_the_ledger_says_what_is_to_come(tmp_path: Path) -> None:
     write_cell(tmp_path, "hopper-forward-control-only-0", [1, 2, 3, 4], [5, 6], diverged=[1])
     names = ["hopper-forward-control-only-0", "hopper-forward-none-0", "half_cheetah-backward-none-0"]
-    write_table(tmp_path / "ledger.csv", ["cell", "state"], [[name, "waiting"] for name in names])
+    write_ledger(tmp_path, dict.fromkeys(names, "waiting"))
+    study = Study(
+        name="made-up",
+        environments=("half_cheetah",),
+        tasks=("backward",),
+        arms=("none",),
+        seeds=(0, 1),
+        seeds_per_cell=2,
+        protocol="smoke",
+    )
+    (tmp_path / "study.json").write_text(to_json(study))
     runs = read_runs(tmp_path)
     assert [(run.number, run.state) for run in runs.found] == [(0, "finished"), (1, "diverged")]
     assert runs.places == [("hopper", "forward"), ("half_cheetah", "backward")]
     assert runs.arms == ["none", "control-only"]
-    assert sum(runs.planned.values()) == 6  # cells that have not begun will be as large
-    assert runs.in_words(runs.arms).startswith("2 of 6 runs are over, 0 under way, 4 to come; 1 of them diverged")
+    assert runs.planned["hopper", "forward", "control-only"] == 2
+    assert runs.planned["half_cheetah", "backward", "none"] == 2  # as study.json has it
+    assert runs.in_words(runs.arms).startswith("2 of 5 runs are over, 0 under way, 3 to come; 1 of them diverged")
+
+
+def test_cells_that_were_given_up_are_neither_under_way_nor_to_come(tmp_path: Path) -> None:
+    for seed, returns in enumerate(([10, 40, 20, 30], [10, 40], [10])):
+        write_cell(tmp_path, f"hopper-forward-none-{seed}", returns)
+    states = ("finished", "failed", "running", "failed", "waiting")
+    write_ledger(tmp_path, {f"hopper-forward-none-{seed}": state for seed, state in enumerate(states)})
+    runs = read_runs(tmp_path)
+    assert [run.state for run in runs.found] == ["finished", "failed", "under way"]
+    words = "1 of 5 runs are over, 1 under way, 1 to come, 2 failed (ledger.csv says why); none diverged."
+    assert runs.in_words(["none"]) == words
+
+
+def test_what_a_diverged_run_counts_and_runs_of_different_length_are_told(tmp_path: Path) -> None:
+    write_cell(tmp_path, "hopper-forward-known-0", [10, 40], diverged=[0])
+    write_cell(tmp_path, "hopper-forward-none-0", [-6, 10, 10, 10])
+    write_cell(tmp_path, "hopper-forward-none-1", [8, 10], num_designs=6)
+    words = read_runs(tmp_path).in_words(["known", "none"])
+    assert "on a design (hopper, forward: -6), on which the means and Welch's test depend" in words
+    assert "until all are over their arm looks worse than it is" in words
+    assert words.endswith("They are to try different numbers of designs: 4, 6.")
 
 
 def test_a_cell_of_another_name_is_refused_and_so_is_a_folder_without_cells(tmp_path: Path) -> None:
@@ -121,10 +192,14 @@ def test_comparisons_pair_by_seed_correct_each_measure_by_itself_and_join_the_pl
     forward, both = rows[1], rows[2]
     assert (forward["runs"], forward["runs_against"], forward["pairs"]) == (3, 4, 3)
     assert forward["difference"] == pytest.approx(30 - 16)
+    assert forward["paired_difference"] == pytest.approx((19 + 5 + 22) / 3)
+    assert (forward["paired_difference_low"], forward["paired_difference_high"]) == (5, 22)  # of three, the ends
+    assert -11 < forward["difference_low"] < 14 < forward["difference_high"] < 45
     assert forward["improvement"] == pytest.approx((4 + 1 + 4) / 12)
     assert forward["welch_p"] == pytest.approx(stats.ttest_ind(mine, [*theirs, 20.0], equal_var=False).pvalue)
     assert forward["paired_p"] == pytest.approx(stats.ttest_rel(mine, theirs).pvalue)
     assert forward["paired_p_holm"] == pytest.approx(2 * stats.ttest_rel(mine, theirs).pvalue)  # two places
     assert both["improvement"] == pytest.approx((9 / 12 + 7 / 9) / 2)
+    assert both["improvement_low"] < both["improvement"] < both["improvement_high"]
     assert (both["runs"], both["runs_against"]) == (6, 7)
     assert math.isnan(float(str(both["welch_p"])))
