@@ -20,7 +20,7 @@ from coim.envs import BODIES
 from recipes.experiment import build, train
 from recipes.interrupt import on_command_line
 from recipes.machine import checked_device
-from recipes.probing.design_space import FILE, SIDE, design_space
+from recipes.probing.design_space import FILE, SIDE, design_space, principal_directions, with_area
 from recipes.probing.errors import change_variance
 from recipes.probing.probed import ProbedCoAdaptation, other_learner
 from recipes.probing.probes import Probes, joined
@@ -122,7 +122,8 @@ def probe(
 def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder: Path) -> str:
     """Fig. 4(b)'s numbers from the models as they are at the end; returns what happened in words.
 
-    They are of the first run that has not diverged.
+    They are of the first run that has not diverged, and of random states among those through whose design enough of the
+    plane can be built.
     """
     if not probed.seen:
         return f"no {FILE}: the run ended before its first measurement"
@@ -132,13 +133,17 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
     run = learning[0]
     seen = joined(probed.seen)[:, run]
     tried = torch.stack([rows["design"][0, run] for rows in probed.seen])
-    chosen = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))[:STATES]
+    order = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))
     models, variance = {}, change_variance(probed.learners["delta"])  # the run axis is dropped from both
     for predict, learner in sorted(probed.learners.items()):
         models[predict] = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, run)
     variance = variance if variance.ndim == 1 else variance[run]
     simulator, bounds = probed.probes.simulator, body.DESIGN_BOUNDS
     try:
+        shown = with_area(seen["design"][order], principal_directions(tried)[0], bounds)
+        chosen = order[shown][:STATES]
+        if not len(chosen):
+            return f"no {FILE}: the plane of the two components leaves the bounds right beside every design tried"
         rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)
     except ValueError as error:
         return f"no {FILE}: {error}"

@@ -19,6 +19,7 @@ from recipes.probing.errors import Model
 from recipes.probing.truth import PlacedSimulator
 
 SIDE = 41  # points along each of the two directions
+AREA = 0.05  # of the square that two entries of a design span: of less, a picture shows next to nothing
 FILE = "design_space.csv"
 
 
@@ -69,6 +70,33 @@ def plane(origin: Tensor, directions: Tensor, bounds: tuple[float, float], *, si
         inside = torch.cat([inside, grid[within(origin + grid @ directions, bounds)]])
         reach = inside
     return grid
+
+
+def with_area(designs: Tensor, directions: Tensor, bounds: tuple[float, float]) -> Tensor:
+    """Designs through which enough of the plane can be built to be looked at.
+
+    Through a corner of the bounds a plane may go that meets them nowhere else: nothing but the corner can be built.
+
+    Args:
+        designs: ``[N, D]``.
+        directions: two unit vectors, ``[2, D]``.
+        bounds: of every entry of a design.
+
+    Returns:
+        Whether the part within the bounds is at least `AREA` of the bounds' width squared, ``[N]`` bool.
+
+    Example:
+        >>> askew = torch.tensor([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]) / 2**0.5
+        >>> with_area(torch.tensor([[1.0] * 4, [2.0] * 4]), askew, (0.5, 2.0))
+        tensor([ True, False])
+    """
+    different, of_design = designs.unique(dim=0, return_inverse=True)
+    areas = []
+    for origin in different:
+        grid = plane(origin, directions, bounds)
+        share = within(origin + grid @ directions, bounds).float().mean()
+        areas.append(share * (grid.amax(0) - grid.amin(0)).prod())
+    return (torch.stack(areas) >= AREA * (bounds[1] - bounds[0]) ** 2)[of_design]
 
 
 def within(designs: Tensor, bounds: tuple[float, float]) -> Tensor:

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
+from interrupted_runs import TINY
 from tensordict import TensorDict
 from torch import Tensor
 
 from coim import HopperMorph, KnownDesigns, NoisyDesigns, RandomDesigns, make_policy, run_episode
+from recipes.model_error import probe, write_design_space
 from recipes.probing.design_space import (
     design_space,
     plane,
     predicted_change,
     principal_directions,
     true_change,
+    with_area,
     within,
 )
 from recipes.probing.errors import mean_squares, persistence_error, prediction_error
-from recipes.probing.probes import NEVER_BUILT, Probes
+from recipes.probing.probes import NEVER_BUILT, Probes, joined
 from recipes.probing.truth import IN_THE_FLOOR, PlacedSimulator
 
 BOUNDS = HopperMorph.DESIGN_BOUNDS
@@ -172,6 +176,17 @@ def test_the_plane_goes_through_the_design_and_fills_the_bounds() -> None:
     assert inside.float().mean() > 0.6  # the grid is that of the slice, not of the shadow of the whole box
 
 
+def test_a_plane_through_a_corner_or_along_an_edge_has_no_area_and_one_through_a_face_has() -> None:
+    corner, face = torch.full((4,), 2.0), torch.tensor([1.0, 1.0, 1.0, 2.0])
+    askew = torch.tensor([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]) / math.sqrt(2)
+    edge = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]) / torch.tensor([[1.0], [math.sqrt(2)]])
+    # The askew plane meets the bounds beside the corner in 0.28 x 0.28 (5 % are 0.34 x 0.34), the face in 1.4 x 1.4.
+    designs = torch.stack([corner, face, corner, corner - 0.1])
+    assert with_area(designs, askew, BOUNDS).tolist() == [False, True, False, False]
+    assert with_area(designs, edge, BOUNDS).tolist() == [False, True, False, True]
+    assert with_area(designs, torch.eye(4)[:2], BOUNDS).all()
+
+
 def test_designs_on_a_line_have_no_second_component() -> None:
     with pytest.raises(ValueError, match="designs on one line, 3 in all"):
         principal_directions(torch.tensor([[1.0, 1.0], [1.5, 1.5], [2.0, 2.0]]))
@@ -199,3 +214,30 @@ def test_the_own_design_changes_nothing_and_the_simulator_agrees_with_itself(row
         change = by_hand(state["observation"], state["action"], design)
         change = change - by_hand(state["observation"], state["action"], own)
         assert point["change/simulator"] == pytest.approx(float(change.square().sum()), rel=1e-3, abs=1e-6)
+
+
+def test_states_whose_plane_is_a_point_are_passed_over_and_the_others_stay_as_they_were_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = probe(HopperMorph, TINY, tmp_path, every=2, rows=4)
+    list(measured)
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(TINY.seed)).tolist()
+    corner, centre = torch.full((4,), 2.0), torch.full((4,), 1.25)
+    designs = [*(centre + 0.75 * torch.tensor([[1.0, -1, 0, 0], [-1.0, 1, 0, 0], [0, 0, 1.0, -1], [0, 0, -1.0, 1]]))]
+    designs.insert(order[1] // 4, corner)  # of four states each; the second one that is drawn is the corner's
+    measured.seen = [measured.seen[0].clone() for _ in designs]
+    for rows, design in zip(measured.seen, designs):
+        rows["design"][:] = design
+    looked_into = []
+
+    def noted(models: dict, simulator: object, rows: TensorDict, *args: object, **kwargs: int) -> list[dict]:
+        looked_into.append(rows)
+        return [{"state": 1}]
+
+    monkeypatch.setattr("recipes.model_error.design_space", noted)
+    write_design_space(measured, HopperMorph, tmp_path)
+    shown = [i for i in order if designs[i // 4] is not corner]
+    assert shown[:3] != order[:3]
+    assert (looked_into[0] == joined(measured.seen)[shown[:3], 0]).all()
+    monkeypatch.setattr("recipes.probing.design_space.AREA", 9.0)
+    assert "leaves the bounds right beside every design tried" in write_design_space(measured, HopperMorph, tmp_path)
