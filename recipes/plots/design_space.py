@@ -13,47 +13,67 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
-from recipes.plots.model_error import FOLDER, Row, folders_with, read
+from recipes.plots.measured import FOLDER, Kind, Row, folders_with, name_of, read
 from recipes.plots.plot import Plot, missing
 from recipes.probing.design_space import FILE
 from recipes.probing.truth import IN_THE_FLOOR
 from recipes.reporting.curves import new_figure
 from recipes.reporting.palette import CIRCLE, put_legend
-from recipes.settings import read_config
 
 SOURCES = {"delta": "model of changes", "next": "model of next states", "simulator": "simulator"}
+STEM = "figure_4b_design_space"
 SHOWN = (1e-3, 1e2)  # variances of one-step changes; beyond, colours end
 
 
 def plots(study: Path) -> Iterator[Plot]:
-    """A row of panels for each state: two models and the simulator."""
-    folders = folders_with(study, FILE)
-    if not folders:
+    """A row of panels for each state: two models and the simulator; of each kind of run its first folder by name."""
+    found = folders_with(study, FILE)
+    if not found:
         line = f"python -m recipes.model_error ENVIRONMENT --out {study / FOLDER}"
-        yield missing("figure_4b_design_space", f"No model was looked into at the end of its run: {line}")
-    for folder in folders:
-        environment, rows = read_config(folder)["environment"], read(folder / FILE)
-        states = sorted({int(row["state"]) for row in rows})
-        figure, grid = new_figure(1.0 + 1.7 * len(states), len(states), len(SOURCES))
-        panels = iter(grid)
-        for state in states:
-            own = [row for row in rows if int(row["state"]) == state]
-            line = [next(panels) for _ in SOURCES]
-            for axes, (source, title) in zip(line, SOURCES.items()):
-                mesh = draw(axes, own, source)
-                axes.set_title(title if state == states[0] else "", fontsize=10)
-            line[0].set(ylabel=f"state {state}\ncomp. 2 (1)")
-        for axes in line:
-            axes.set(xlabel="component 1 (1)")
-        bar = figure.colorbar(mesh, ax=grid, extend="both", shrink=0.8)
-        bar.set_label("squared change of the next state\n(variances of one-step changes, 1)")
-        put_legend(figure, handles())
-        caption = describe(environment, rows)
-        yield Plot(name=f"figure_4b_design_space_{environment}", figure=figure, rows=rows, caption=caption)
+        yield missing(STEM, f"No model was looked into at the end of its run: {line}")
+    for kind, (folder, *others) in found.items():
+        name, rows = name_of(STEM, kind, found), read(folder / FILE)
+        rows, left_out = with_area(rows)
+        if not rows:
+            yield missing(name, f"{folder / FILE} has no plane to draw: beside the own design all is out of bounds.")
+            continue
+        caption = describe(kind, rows) + " " + told_of(folder, others, left_out, study)
+        yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption)
+
+
+def with_area(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+    """Rows of the states whose plane is more than a point or a line, and the other states."""
+    left_out = []
+    for state in sorted({row["state"] for row in rows}, key=int):
+        grid = [row for row in rows if row["state"] == state and row["point"] == "grid"]
+        if any(len({float(row[key]) for row in grid}) < 2 for key in ("pc_1", "pc_2")):
+            left_out.append(state)
+    return [row for row in rows if row["state"] not in left_out], left_out
+
+
+def drawn(rows: Sequence[Row]) -> Figure:
+    """A line of panels for each state, a column for each source."""
+    states = sorted({int(row["state"]) for row in rows})
+    figure, grid = new_figure(1.0 + 1.7 * len(states), len(states), len(SOURCES))
+    panels = iter(grid)
+    for state in states:
+        own = [row for row in rows if int(row["state"]) == state]
+        line = [next(panels) for _ in SOURCES]
+        for axes, (source, title) in zip(line, SOURCES.items()):
+            mesh = draw(axes, own, source)
+            axes.set_title(title if state == states[0] else "", fontsize=10)
+        line[0].set(ylabel=f"state {state}\ncomp. 2 (1)")
+    for axes in line:
+        axes.set(xlabel="component 1 (1)")
+    bar = figure.colorbar(mesh, ax=grid, extend="both", shrink=0.8)
+    bar.set_label("squared change of the next state\n(variances of one-step changes, 1)")
+    put_legend(figure, handles())
+    return figure
 
 
 def draw(axes: Axes, rows: Sequence[Row], source: str) -> QuadMesh:
@@ -67,7 +87,7 @@ def draw(axes: Axes, rows: Sequence[Row], source: str) -> QuadMesh:
         change[at], depth[at] = float(row[f"normalised/{source}"]), float(row["depth"])
     norm = LogNorm(*SHOWN, clip=True)
     mesh = axes.pcolormesh(x, y, change, norm=norm, cmap="cividis", shading="nearest", rasterized=True)
-    if (depth > IN_THE_FLOOR).any() and min(shape) > 1:
+    if (depth > IN_THE_FLOOR).any():
         axes.contourf(x, y, depth, levels=[IN_THE_FLOOR, np.inf], colors="none", hatches=["////"])
         axes.contour(x, y, depth, levels=[IN_THE_FLOOR], colors="white", linewidths=0.8)
     tried = [(float(row["pc_1"]), float(row["pc_2"])) for row in rows if row["point"] == "tried"]
@@ -87,7 +107,7 @@ def handles() -> list[Line2D | Patch]:
     ]
 
 
-def describe(environment: str, rows: Sequence[Row]) -> str:
+def describe(kind: Kind, rows: Sequence[Row]) -> str:
     """What is seen, and how far the models are from the simulator where the state is possible."""
     grid = [row for row in rows if row["point"] == "grid"]
     deep = np.array([float(row["depth"]) > IN_THE_FLOOR for row in grid])
@@ -99,8 +119,18 @@ def describe(environment: str, rows: Sequence[Row]) -> str:
             medians.append(f"where the state is {words}: {told}")
     shares = ", ".join(f"{float(rows[0][key]):.0%}" for key in ("share_1", "share_2"))
     return (
-        f"Squared change of the next state on {environment} when the design alone changes, for randomly drawn stored "
-        "states and actions. The axes are the first two principal components of the designs tried, in scale factors "
+        f"Squared change of the next state on {kind.environment}, {kind.task}, {kind.designs} designs, when the design "
+        "alone changes, for stored states and actions drawn at random among those whose plane has an area within the "
+        "bounds. The axes are the first two principal components of the designs tried, in scale factors "
         f"({shares} of their variance), drawn through the state's own design; white is out of bounds. Hatched: more "
         f"than {IN_THE_FLOOR * 100:.0f} cm of the body would be in the floor. Medians {'; '.join(medians)}."
     )
+
+
+def told_of(folder: Path, others: Sequence[Path], left_out: Sequence[str], study: Path) -> str:
+    """Whose models these are, and which states and runs are not drawn."""
+    first, *rest = (path.relative_to(study).as_posix() for path in (folder, *others))
+    told = f"Of {first}" + (f", the first by name; not drawn: {', '.join(rest)}." if rest else ".")
+    if left_out:
+        told += f" Not drawn, because beside the own design all is out of bounds: state {', '.join(left_out)}."
+    return told

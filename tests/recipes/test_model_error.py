@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from interrupted_runs import TINY, PowerCut, no_picture
 from interrupted_runs import run as run_alone
+from matplotlib.collections import QuadMesh
 from tensordict import TensorDict
 
 from coim import HopperMorph, Policy
@@ -215,14 +218,50 @@ def test_the_figures_show_what_was_measured(study: Path) -> None:
     (errors,), (space,) = model_error.plots(study), design_space.plots(study)
     assert (errors.name, space.name) == ("figure_4a_model_error_hopper", "figure_4b_design_space_hopper")
     measured = read(study / "model_error" / "model_error.csv")
-    assert [dict(row) for row in errors.rows] == measured
+    assert [{name: row[name] for name in measured[0]} for row in errors.rows] == measured
     panels = errors.figure.axes
     assert [axes.get_yscale() for axes in panels] == ["log"] * 4
-    seen = [float(row["normalised"]) for row in measured if (row["probe"], row["predict"]) == ("seen", "next")]
-    assert panels[1].lines[0].get_ydata().tolist() == seen
-    assert f"seen {seen[-1]:.3g}" in errors.caption
-    states, sources = {row["state"] for row in space.rows}, 3
-    assert len(space.figure.axes) == len(states) * sources + 1  # and the scale of the colours
+    kinds = [(column, predict) for column in ("normalised", "mse") for predict in ("delta", "next")]
+    for axes, (column, predict) in zip(panels, kinds, strict=True):
+        drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
+        for probe_name in ("next", *PROBES):
+            own, still = (
+                {int(row["env_steps"]): float(row[column]) for row in measured if is_of(row, probe_name, of)}
+                for of in (predict, "nothing")
+            )
+            expected = [(x, y / still[x] if column == "normalised" else y) for x, y in own.items() if math.isfinite(y)]
+            np.testing.assert_allclose(drawn[probe_name], np.array(expected).reshape(-1, 2), rtol=1e-6)
+        assert ("no change" in drawn) == (column == "normalised")
+    last = [row for row in measured if is_of(row, "seen", "next") or is_of(row, "seen", "nothing")][-2:]  # of 48 steps
+    assert (
+        f"seen {float(last[0]['normalised']) / float(last[1]['normalised']):.3g}" in errors.caption.split("next obs")[1]
+    )
+
+
+def is_of(row: dict[str, str], probe_name: str, predict: str) -> bool:
+    return (row["probe"], row["predict"]) == (probe_name, predict)
+
+
+def test_each_panel_of_the_design_space_has_the_colours_of_its_state_and_source_where_they_belong(study: Path) -> None:
+    (space,) = design_space.plots(study)
+    rows = read(study / "model_error" / "design_space.csv")
+    assert [dict(row) for row in space.rows] == rows
+    states = sorted({row["state"] for row in rows})
+    panels = [(state, source) for state in states for source in ("delta", "next", "simulator")]
+    assert len(space.figure.axes) == len(panels) + 1  # and the scale of the colours
+    for axes, (state, source) in zip(space.figure.axes, panels):
+        grid = [row for row in rows if (row["state"], row["point"]) == (state, "grid")]
+        (mesh,) = (found for found in axes.collections if isinstance(found, QuadMesh))
+        corners, values = mesh.get_coordinates(), np.ma.masked_invalid(mesh.get_array())
+        shown = np.zeros(values.shape, bool)
+        for row in grid:
+            place = float(row["pc_1"]), float(row["pc_2"])
+            there = ((corners[:-1, :-1] < place) & (place < corners[1:, 1:])).all(-1)
+            assert there.sum() == 1
+            shown |= there
+            assert values.filled(math.nan)[there] == pytest.approx(float(row[f"normalised/{source}"]), nan_ok=True)
+        assert len({*values.compressed()}) > 5
+        assert values.mask[~shown].all()  # out of bounds
 
 
 def test_a_measured_run_without_a_measurement_yet_is_told_not_drawn(study: Path, tmp_path: Path) -> None:
@@ -232,7 +271,7 @@ def test_a_measured_run_without_a_measurement_yet_is_told_not_drawn(study: Path,
     (folder / probed.FILE).write_text(",".join(probed.COLUMNS) + "\n")
     (plot,) = model_error.plots(tmp_path)
     assert plot.figure is None
-    assert "has no measurement yet" in plot.caption
+    assert f"There is no measurement yet in {folder / probed.FILE}" in plot.caption
 
 
 def test_without_its_input_a_figure_says_what_to_run(tmp_path: Path) -> None:
