@@ -2,12 +2,14 @@
 
 What an arm found are the designs that it chose by Eq. 5 (kind "optimised"), of all its seeds together: the first
 designs are given to every arm, and the random ones are nobody's merit. Its best half, by the best return in the study,
-is trained anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined.
+is trained anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined. All arms of an
+environment and task keep the same share, also where the cap of --most makes it less: of more candidates an equal number
+would be a better selection, and the arm with more runs ahead without merit.
 
 ``retrained/designs.csv`` in the study's folder names what was chosen; what stands there is not chosen again when the
-study grows, and says how many of the arm's runs were over by then. Beside it are a ledger and ``cells/`` with an
-ordinary run folder for each. Run it again and it goes on: what is finished is skipped, what was stopped is resumed from
-its checkpoint.
+study grows, and says how many of the arm's runs were over by then, and how many of how many designs were kept. Beside
+it are a ledger and ``cells/`` with an ordinary run folder for each. Run it again and it goes on: what is finished is
+skipped, what was stopped is resumed from its checkpoint.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ import math
 import signal
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import tyro
@@ -34,6 +37,10 @@ from recipes.studies.conduct import Conductor, Resources, ray_running, refuse_la
 from recipes.studies.definition import Cell
 from recipes.writing import write_whole
 
+RULE = {"top": 0.5, "most": 18}  # of Fig. 2
+DEFAULT = ", as the study gave to a first design (the paper: 300); --episodes takes another number"
+Line = dict[str, str]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Retrain:
@@ -43,10 +50,10 @@ class Retrain:
     """Folder of the study."""
     arms: tuple[str, ...] = ("none", "known")
     """Whose designs."""
-    top: float = 0.5
-    """Share of an arm's optimised designs, the best ones (Fig. 2: the top 50 %)."""
-    most: int = 18
-    """At most so many of each arm, environment and task (Fig. 2: 18 samples)."""
+    top: float | None = None
+    """Share of an arm's optimised designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
+    most: int | None = None
+    """At most so many of each arm, environment and task; by default what was chosen by before, or 18 (Fig. 2)."""
     episodes: int | None = None
     """Training episodes on each; by default as many as the study gave to a first design."""
     workers: int = 0
@@ -96,7 +103,8 @@ def retrain(asked: Retrain) -> list[str]:
 
     Raises:
         ValueError: if the share is not in (0, 1], a count is below 1, an arm is none of the study's, no design was
-            found yet, what is retrained already was retrained otherwise, or a GPU is asked for and none is here.
+            found yet, what is retrained already was chosen or trained otherwise, or a GPU is asked for and none is
+            here.
     """
     check(asked)
     folder = asked.study / "retrained"
@@ -108,6 +116,7 @@ def retrain(asked: Retrain) -> list[str]:
         print(f"{waiting} of {len(cells)} designs to train -> {folder}")
         if not waiting:
             return []
+        print(f"{episodes_in_words(cells)} training episodes on each{'' if asked.episodes else DEFAULT}")
         workers = asked.workers or available_cores()
         # Ray takes SIGTERM for itself when it starts.
         with ray_running(address=asked.ray_address, workers=workers), stopping_at_once():
@@ -118,7 +127,7 @@ def retrain(asked: Retrain) -> list[str]:
 
 def check(asked: Retrain) -> None:
     """Refuse what cannot be done."""
-    if not 0 < asked.top <= 1:
+    if asked.top is not None and not 0 < asked.top <= 1:
         raise ValueError(f"--top is {asked.top}, a share of the designs lies in (0, 1]; Fig. 2 has 0.5")
     for name, least in (("most", 1), ("episodes", 1), ("workers", 0), ("gpus", 0)):
         if (value := getattr(asked, name)) is not None and value < least:
@@ -127,19 +136,24 @@ def check(asked: Retrain) -> None:
         raise ValueError("--workers is of this machine; a cluster decides itself, by --gpus of each design")
 
 
-def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
+def episodes_in_words(cells: Sequence[Retraining]) -> str:
+    """Of the designs, which differ where the environments of a study do."""
+    return " or ".join(str(count) for count in sorted({cell.settings.first_episodes for cell in cells}))
+
+
+def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
     """Lines of ``designs.csv``: those that stand there, and those of arms that are asked for and have none there."""
-    lines = []
+    lines: list[Line] = []
     if path.is_file():
         with path.open(newline="") as file:
             lines = list(csv.DictReader(file))
-    there = {(line["environment"], line["task"], line["arm"]) for line in lines}
     for arm in asked.arms:
         if arm not in runs.arms:
             raise ValueError(f"{arm!r} is no arm of {asked.study}; name some of its own: --arms {' '.join(runs.arms)}")
-        for place in runs.places:
-            if (*place, arm) not in there:
-                lines += best_designs(runs, place, arm, asked)
+    rule = rule_of(lines, asked)
+    for place in runs.places:
+        there = {line["arm"]: line for line in lines if (line["environment"], line["task"]) == place}
+        lines += best_designs(runs, place, [arm for arm in asked.arms if arm not in there], rule, there.values())
     if not lines:
         raise ValueError(f"no run of {', '.join(asked.arms)} has an optimised design yet; let the study go on")
     text = io.StringIO()
@@ -150,16 +164,57 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[dict[str, str]]:
     return lines
 
 
-def best_designs(runs: Runs, place: Place, arm: str, asked: Retrain) -> Iterator[dict[str, str]]:
-    """The best share of what an arm found in one environment and task, best first."""
+def rule_of(lines: Sequence[Line], asked: Retrain) -> dict[str, float]:
+    """``top`` and ``most``: what is asked for, or was chosen by before.
+
+    Raises:
+        ValueError: if the two differ. What was chosen stays, and arms that come beside it are compared with it.
+    """
+    rule: dict[str, float] = {}
+    for name, usual in RULE.items():
+        wanted = getattr(asked, name)
+        used = next((type(usual)(line[name]) for line in lines if line.get(name)), None)
+        if None not in (wanted, used) and wanted != used:
+            raise ValueError(
+                f"--{name} is {wanted}, but the designs in {asked.study}/retrained were chosen by {used}; leave the "
+                "option out, or delete that folder to choose and train all of them anew"
+            )
+        rule[name] = next(value for value in (wanted, used, usual) if value is not None)
+    return rule
+
+
+def best_designs(
+    runs: Runs, place: Place, arms: Sequence[str], rule: Mapping[str, float], there: Iterable[Line] = ()
+) -> Iterator[Line]:
+    """The best share of what each arm found in one environment and task, best first.
+
+    Args:
+        runs: of the study.
+        place: environment and task.
+        arms: whose designs.
+        rule: ``top`` and ``most``.
+        there: a line of each arm that was chosen from before; with the largest of all the cap is turned into a share.
+    """
+    found = {arm: candidates(runs, place, arm) for arm in arms}
+    largest = max([*map(len, found.values()), *(int(line["found"]) for line in there if line.get("found"))], default=0)
+    if not largest:
+        return
+    share = min(Fraction(str(rule["top"])), Fraction(int(rule["most"]), largest))
+    for arm, pairs in found.items():
+        kept = math.ceil(share * len(pairs))
+        noted = {"over": sum(run.over for run in runs.of(place, arm)), "planned": runs.planned[*place, arm]}
+        noted |= {"found": len(pairs), "kept": kept, **rule}
+        for run, row in pairs[:kept]:
+            yield line_of(run, row) | {name: str(value) for name, value in noted.items()}
+
+
+def candidates(runs: Runs, place: Place, arm: str) -> list[tuple[Run, Row]]:
+    """Designs that Eq. 5 chose, best first."""
     found = [(run, row) for run in runs.of(place, arm) for row in run.designs if row["kind"] == "optimised"]
-    found.sort(key=lambda pair: -pair[1]["best_return"])
-    over = {"over": str(sum(run.over for run in runs.of(place, arm))), "planned": str(runs.planned[*place, arm])}
-    for run, row in found[: min(asked.most, math.ceil(asked.top * len(found)))]:
-        yield line_of(run, row) | over
+    return sorted(found, key=lambda pair: -pair[1]["best_return"])
 
 
-def line_of(run: Run, row: Row) -> dict[str, str]:
+def line_of(run: Run, row: Row) -> Line:
     """A design and where it comes from."""
     cell = run.record.name
     return {
@@ -176,7 +231,7 @@ def line_of(run: Run, row: Row) -> dict[str, str]:
     }
 
 
-def cell_of(line: dict[str, str], asked: Retrain) -> Retraining:
+def cell_of(line: Line, asked: Retrain) -> Retraining:
     """Plain SAC on one body: the settings of the cell that found it, less population, imagination and search."""
     settings = saved_settings(asked.study / "cells" / line["cell"])
     settings = dataclasses.replace(

@@ -11,9 +11,8 @@ import pytest
 from coim import HopperMorph
 from recipes import experiment
 from recipes.figures import write_figures
-from recipes.plots import retrained
 from recipes.plots.runs import read_runs
-from recipes.retrain import Retrain, best_designs, cell_of, choose, main
+from recipes.retrain import Retrain, best_designs, cell_of, choose, episodes_in_words, main
 from recipes.settings import Settings, parse, plain
 from tests.recipes.made_up_study import KINDS, read_table, write_cell
 from tests.recipes.test_experiment import TINY
@@ -30,16 +29,40 @@ def study(tmp_path: Path) -> Path:
     return tmp_path
 
 
+RULE = {"top": 0.5, "most": 18}
+
+
 def test_the_best_half_is_of_the_designs_that_eq_5_chose_from_all_seeds_together(study: Path) -> None:
     assert KINDS[2] == "optimised"
     runs = read_runs(study)
-    found = list(best_designs(runs, PLACE, "known", Retrain(study=study)))
+    found = list(best_designs(runs, PLACE, ["known"], RULE))
     assert [line["found_return"] for line in found] == ["33", "31", "29"]  # half of five, rounded up
     assert found[0]["folder"] == "hopper-forward-known-2-run0-design3"
     assert found[0]["xi"] == "1 1"
-    assert [line["run"] for line in best_designs(runs, PLACE, "none", Retrain(study=study))] == ["1"]
-    most = Retrain(study=study, top=1.0, most=2)
-    assert [line["found_return"] for line in best_designs(runs, PLACE, "known", most)] == ["33", "31"]
+    assert {(line["found"], line["kept"], line["top"], line["most"]) for line in found} == {("5", "3", "0.5", "18")}
+    assert [line["run"] for line in best_designs(runs, PLACE, ["none"], RULE)] == ["1"]
+    most = list(best_designs(runs, PLACE, ["known"], {"top": 1.0, "most": 2}))
+    assert [line["found_return"] for line in most] == ["33", "31"]
+
+
+def test_the_cap_takes_the_same_share_of_an_arm_with_more_designs_and_of_one_with_less(tmp_path: Path) -> None:
+    for arm, count in (("none", 12), ("known", 6)):
+        write_cell(tmp_path, f"hopper-forward-{arm}-0", *([90, 20, best, 80] for best in range(count)))
+    runs = read_runs(tmp_path)
+    rule = {"top": 0.5, "most": 4}
+    together = list(best_designs(runs, PLACE, ["none", "known"], rule))
+    assert [line["arm"] for line in together] == ["none"] * 4 + ["known"] * 2  # a third of each
+    assert [line["found_return"] for line in together if line["arm"] == "known"] == ["5", "4"]
+    later = list(best_designs(runs, PLACE, ["known"], rule, there=together[:1]))
+    assert later == together[4:]
+    thirds = list(best_designs(runs, PLACE, ["none"], {"top": 0.1, "most": 4}))
+    assert len(thirds) == 2  # 1.2, rounded up
+
+
+def test_the_cap_is_kept_to_the_last_bit(tmp_path: Path) -> None:
+    write_cell(tmp_path, "hopper-forward-known-0", *([90, 20, best, 80] for best in range(25)))
+    assert 7 / 25 * 25 > 7  # rounded up, it would be eight
+    assert len(list(best_designs(read_runs(tmp_path), PLACE, ["known"], {"top": 0.5, "most": 7}))) == 7
 
 
 def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study: Path) -> None:
@@ -50,6 +73,30 @@ def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study
     assert both[:3] == first
     assert [line["arm"] for line in both[3:]] == ["none"]
     assert read_table(path) == both
+
+
+def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Path) -> None:
+    path, runs = study / "chosen.csv", read_runs(study)
+    choose(runs, path, Retrain(study=study, arms=("known",), top=0.7, most=3))
+    before = path.read_bytes()
+    for name, value, words in (
+        (
+            "top",
+            0.5,
+            "--top is 0.5, but the designs in .*retrained were chosen by 0.7; leave the option out, or delete",
+        ),
+        ("most", 4, "--most is 4, but the designs in .*retrained were chosen by 3; leave"),
+    ):
+        for arms in (("known",), ("none",)):
+            with pytest.raises(ValueError, match=words):
+                choose(runs, path, Retrain(study=study, arms=arms, **{name: value}))
+    assert path.read_bytes() == before
+    lines = choose(runs, path, Retrain(study=study, top=0.7))  # the same, and one that is left out
+    assert [(line["arm"], line["found"], line["kept"]) for line in lines] == [
+        *[("known", "5", "3")] * 3,
+        *[("none", "2", "2")] * 2,  # 3/5 of two, rounded up
+    ]
+    assert {(line["top"], line["most"]) for line in lines} == {("0.7", "3")}
 
 
 def settings_of(study: Path, cell: str, **values: object) -> Settings:
@@ -63,7 +110,7 @@ def settings_of(study: Path, cell: str, **values: object) -> Settings:
 def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_one_body(study: Path) -> None:
     cell = "hopper-forward-known-2"
     settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
-    lines = list(best_designs(read_runs(study), PLACE, "known", Retrain(study=study)))
+    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))
     own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
     assert (own.designs, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
     assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
@@ -87,7 +134,9 @@ def test_designs_are_retrained_once_and_drawn(
         main([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
     capsys.readouterr()
     main([str(tmp_path), "--episodes", "2", "--workers", "1"])
-    assert "2 of 2 designs to train" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "2 of 2 designs to train" in said
+    assert "\n2 training episodes on each\n" in said
     chosen = read_table(tmp_path / "retrained" / "designs.csv")
     for line in chosen:
         cell = tmp_path / "cells" / line["cell"]
@@ -107,15 +156,12 @@ def test_designs_are_retrained_once_and_drawn(
         assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
 
 
-def test_designs_that_were_chosen_before_all_runs_were_over_say_so(study: Path) -> None:
-    write_cell(study, "hopper-forward-known-8", [90, 20])
-    (study / "retrained").mkdir()
-    lines = choose(read_runs(study), study / "retrained" / "designs.csv", Retrain(study=study))
-    assert {(line["arm"], line["over"], line["planned"]) for line in lines} == {("known", "5", "6"), ("none", "2", "2")}
-    for line in lines:
-        write_cell(study, line["folder"], [1], part="retrained/cells", num_designs=1)
-    (plot,) = retrained.plots(study)
-    assert "Chosen before all runs were over (hopper, forward, known: 5 of 6). " in plot.caption
+def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None:
+    for seed in (2, 0):
+        settings_of(study, f"hopper-forward-known-{seed}", first_episodes=300 + seed)
+    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[:2]
+    assert episodes_in_words([cell_of(line, Retrain(study=study)) for line in lines]) == "300 or 302"
+    assert episodes_in_words([cell_of(line, Retrain(study=study, episodes=9)) for line in lines]) == "9"
 
 
 def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:
