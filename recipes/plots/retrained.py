@@ -1,4 +1,4 @@
-"""Fig. 2: returns of the best designs that each arm found, retrained from scratch."""
+"""Fig. 2: returns of the best designs that Eq. 5 chose in each arm, retrained from scratch."""
 
 from __future__ import annotations
 
@@ -12,37 +12,49 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from recipes.plots import arms as styles
-from recipes.plots.intervals import interval, mean
-from recipes.plots.measures import pairs_of_arms, welch
+from recipes.plots import retrained_pairs
 from recipes.plots.plot import Plot, missing
-from recipes.plots.runs import Run, runs_of_folder
+from recipes.plots.retrained_pairs import Cells, by_place, sizes
+from recipes.plots.runs import Run, Runs, read_runs, runs_of_folder
 from recipes.reporting.records import number
 
 NAME = "figure_2_retrained"
-Cells = dict[str, object]
+Line = dict[str, str]
 
 
 def plots(study: Path) -> Iterator[Plot]:
-    """One figure, from what `recipes.retrain` wrote."""
-    path = study / "retrained" / "designs.csv"
+    """The designs and the tests between arms, from what `recipes.retrain` wrote."""
+    path, command = study / "retrained" / "designs.csv", f"python -m recipes.retrain {study}"
     if not path.is_file():
-        yield missing(NAME, f"No design was retrained: python -m recipes.retrain {study}.")
+        yield from nothing(f"No design was retrained: {command}.")
         return
     with path.open(newline="") as file:
         listed = list(csv.DictReader(file))
-    rows = results(path.parent, listed)
+    rows, lost = results(path.parent, listed)
     if not rows:
-        yield missing(NAME, f"None of {len(listed)} designs is retrained yet: python -m recipes.retrain {study}.")
+        diverged = f"; {lost} diverged before their first return" if lost else ""
+        yield from nothing(f"None of {len(listed)} designs is retrained yet: {command}{diverged}.")
         return
-    yield draw(rows, len(listed), early(listed))
+    table = retrained_pairs.pairs(rows)
+    yield draw(rows, f"{caption(rows, listed, lost)} {early(read_runs(study), listed)}{told(rows, table)}")
+    yield retrained_pairs.draw(table)
 
 
-def results(folder: Path, listed: Sequence[dict[str, str]]) -> list[Cells]:
-    """A row for each design whose retraining is over.
+def nothing(words: str) -> Iterator[Plot]:
+    """Instead of both figures."""
+    yield missing(NAME, words)
+    yield missing(retrained_pairs.NAME, words)
+
+
+def results(folder: Path, listed: Sequence[Line]) -> tuple[list[Cells], int]:
+    """Retrainings that are over.
 
     One that diverged counts with the best return that it had; if it had none, with the lowest of its place.
+
+    Returns:
+        A row for each, and the number of those left out: without a return, as all of their place.
     """
-    over: list[tuple[dict[str, str], Run]] = []
+    over: list[tuple[Line, Run]] = []
     for line in listed:
         found = runs_of_folder(
             folder / "cells" / line["folder"], line["environment"], line["task"], line["arm"], int(line["seed"])
@@ -50,52 +62,123 @@ def results(folder: Path, listed: Sequence[dict[str, str]]) -> list[Cells]:
         over += [(line, run) for run in found if run.over]
     lowest: dict[tuple[str, str], float] = {}
     for line, run in over:
-        place = line["environment"], line["task"]
-        lowest[place] = min([lowest.get(place, math.inf), *(row["best_return"] for row in run.designs)])
-    return [
-        {name: line[name] for name in ("environment", "task", "arm", "seed", "run", "design", "xi")}
-        | {"found_return": float(line["found_return"])}
-        | {"best_return": float(run.best_returns(lowest[line["environment"], line["task"]]).max())}
-        | {"diverged": int(run.diverged)}
+        for row in run.designs:
+            place = line["environment"], line["task"]
+            lowest[place] = min(lowest.get(place, math.inf), row["best_return"])
+    rows = [
+        result(line, run, lowest[line["environment"], line["task"]])
         for line, run in over
+        if (line["environment"], line["task"]) in lowest
     ]
+    for own in by_place(rows).values():
+        for designs in own.values():
+            counts = {f"arm_{name}": count for name, count in sizes(designs).items()}
+            for row in designs:
+                row.update(counts)
+    return rows, len(over) - len(rows)
 
 
-def early(listed: Sequence[dict[str, str]]) -> str:
-    """Whose designs were chosen before all runs of the arm were over, in words; those found later had no chance."""
-    counts = {
-        (line["environment"], line["task"], line["arm"]): (line["over"], line["planned"])
-        for line in listed
-        if line.get("over") != line.get("planned")
-    }
-    told = [f"{', '.join(which)}: {over} of {planned}" for which, (over, planned) in counts.items()]
-    return f"Chosen before all runs were over ({'; '.join(told)}). " if told else ""
-
-
-def draw(rows: Sequence[Cells], planned: int, early: str = "") -> Plot:
-    """A panel for each environment and task."""
-    places = list(dict.fromkeys((str(row["environment"]), str(row["task"])) for row in rows))
-    figure = Figure(figsize=(max(3.6, 2.6 * len(places)), 3.4), layout="constrained")
-    said = []
-    for axes, place in zip(figure.subplots(1, len(places), squeeze=False)[0], places):
-        own = [row for row in rows if (row["environment"], row["task"]) == place]
-        values = {
-            arm: np.array([row["best_return"] for row in own if row["arm"] == arm], dtype=float)
-            for arm in styles.in_order(str(row["arm"]) for row in own)
-        }
-        draw_panel(axes, values)
-        tests = [tested(values, arm, against) for arm, against in pairs_of_arms(list(values))]
-        said += [f"{', '.join(place)}: {words}" for words in tests]
-        axes.set(title=", ".join(place), ylabel="best return, retrained from scratch (1)")
-    diverged = sum(bool(row["diverged"]) for row in rows)
-    caption = (
-        "Highest return of the deterministic policy of plain SAC, trained from scratch on the best designs of each arm "
-        "(boxes: quartiles and median, whiskers: all designs; points: designs). "
-        f"{len(rows)} of {planned} designs are retrained, {diverged} of them diverged"
-        f"{' and count with the best return until then' if diverged else ''}. {early}{'; '.join(said)}"
-        f"{'. ' if said else ''}The test takes designs for independent, as the paper does; those of one run are not."
+def result(line: Line, run: Run, failure: float) -> Cells:
+    """A row of the CSV file; ``replaced`` is 1 where ``failure`` stands for a return that there is not."""
+    settings = run.record.settings
+    return (
+        {name: line[name] for name in ("environment", "task", "arm", "seed", "run", "design", "xi")}
+        | {"found_return": float(line["found_return"]), "best_return": float(run.best_returns(failure).max())}
+        | {"diverged": int(run.diverged), "replaced": int(not run.designs)}
+        | {"episodes": settings["first_episodes"], "study_episodes": settings["episodes"]}
+        | {name: int(line[name]) if line.get(name) else "" for name in ("found", "kept")}
     )
-    return Plot(name=NAME, figure=figure, rows=rows, caption=caption)
+
+
+def early(runs: Runs, listed: Sequence[Line]) -> str:
+    """Whose designs were chosen before all runs were over that the study plans by now, in words."""
+    chosen = {(line["environment"], line["task"], line["arm"]): line.get("over") for line in listed}
+    words = [
+        f"{', '.join(which)}: {over} of {runs.planned[which]}"
+        for which, over in chosen.items()
+        if over and int(over) < runs.planned[which]
+    ]
+    if not words:
+        return ""
+    return f"Chosen before all runs were over ({'; '.join(words)} planned now); designs of the others had no chance. "
+
+
+def caption(rows: Sequence[Cells], listed: Sequence[Line], lost: int) -> str:
+    """What is drawn, and which rules applied."""
+    episodes, in_study = (
+        " or ".join(str(count) for count in sorted({int(str(row[name])) for row in rows}))
+        for name in ("episodes", "study_episodes")
+    )
+    diverged, replaced = (sum(bool(row[name]) for row in rows) for name in ("diverged", "replaced"))
+    words = (
+        f"Highest return of the deterministic policy of plain SAC in {episodes} training episodes from scratch on each "
+        "of the best designs that Eq. 5 chose in each arm, by their return in the study, where such a design had "
+        f"{in_study} episodes; first and random designs are left out, even where they were better. Boxes: quartiles "
+        "and median; whiskers: all designs; points: designs, each with a seed of its own, also where a body comes "
+        f"again. {len(rows) + lost} of {len(listed)} designs are retrained, {diverged + lost} of them diverged"
+    )
+    if diverged > replaced:
+        words += "; these count with the best return until then"
+    if replaced:
+        words += f"; {replaced} without a return until then: counts with the lowest best return of its place"
+    if lost:
+        words += f"; {lost} left out, as no retraining of their environment and task has a return"
+    return f"{words}."
+
+
+def told(rows: Sequence[Cells], table: Sequence[Cells]) -> str:
+    """Where the designs of each arm come from, and how the arms differ."""
+    sentences = []
+    for place, own in by_place(rows).items():
+        arms = "; ".join(origin(arm, designs) for arm, designs in own.items())
+        sentences.append(f"{', '.join(place)}: {arms}.{' ' + UNEQUAL if unequal(own) else ''}")
+    sentences += [compared(row) for row in table]
+    if table:
+        sentences.append("Designs of one run are not independent, as the test over designs takes them to be.")
+    return " ".join(sentences)
+
+
+UNEQUAL = "The shares differ, which favours the arm with the smaller one."
+
+
+def origin(arm: str, designs: Sequence[Cells]) -> str:
+    """Of one arm's designs."""
+    counts, first = sizes(designs), designs[0]
+    words = f"{arm}: {counts['designs']} designs, distinct bodies {counts['bodies']}, runs {counts['runs']}"
+    if not first["found"]:
+        return words
+    found, kept = int(str(first["found"])), int(str(first["kept"]))
+    return f"{words}, chosen as the best {kept} of {found} ({100 * kept / found:.0f} %)"
+
+
+def unequal(own: dict[str, list[Cells]]) -> bool:
+    """Whether no one share, rounded up to whole designs, gives the number that was kept of each arm."""
+    counts = [(int(str(rows[0]["kept"])), int(str(rows[0]["found"]))) for rows in own.values() if rows[0]["found"]]
+    return bool(counts) and max((kept - 1) / found for kept, found in counts) >= min(k / f for k, f in counts)
+
+
+def compared(row: Cells) -> str:
+    """A pair of arms in words."""
+    difference, low, high = (float(str(row[f"difference{end}"])) for end in ("", "_low", "_high"))
+    words = "{environment}, {task}: {arm} minus {against} ".format(**row) + number(difference, 3)
+    if math.isfinite(low):
+        words += f" (95 % interval over runs {number(low, 3)} to {number(high, 3)})"
+    designs, runs = (float(str(row[name])) for name in retrained_pairs.TESTS)
+    over_designs = f"p = {designs:.2g}" if math.isfinite(designs) else "too few designs for a test"
+    over_runs = f"p = {runs:.2g}" if math.isfinite(runs) else "too few runs for a test"
+    return f"{words}, Welch's t-test over designs, as in the paper: {over_designs}; over one mean per run: {over_runs}."
+
+
+def draw(rows: Sequence[Cells], words: str) -> Plot:
+    """A panel for each environment and task."""
+    places = by_place(rows)
+    widths = [max(2.6, 0.6 + 0.75 * len(own)) for own in places.values()]  # inches, with room for the names of arms
+    figure = Figure(figsize=(max(3.6, sum(widths)), 3.4), layout="constrained")
+    panels = figure.subplots(1, len(places), squeeze=False, width_ratios=widths)[0]
+    for axes, (place, own) in zip(panels, places.items()):
+        draw_panel(axes, {arm: np.array([row["best_return"] for row in rows], float) for arm, rows in own.items()})
+        axes.set(title=", ".join(place), ylabel="best return, retrained from scratch (1)")
+    return Plot(name=NAME, figure=figure, rows=rows, caption=words)
 
 
 def draw_panel(axes: Axes, values: dict[str, np.ndarray]) -> None:
@@ -109,16 +192,5 @@ def draw_panel(axes: Axes, values: dict[str, np.ndarray]) -> None:
         )  # fmt: skip
         spread = x + np.linspace(-0.18, 0.18, len(returns) + 2)[1:-1]
         axes.scatter(spread, returns, s=14, color=colour, marker=styles.MARKERS.get(arm, "o"), zorder=3)
-    axes.set(xticks=range(len(values)), xticklabels=[f"{arm}\n(n = {len(v)})" for arm, v in values.items()])
+    axes.set(xticks=range(len(values)), xticklabels=[f"{arm}\nn = {len(v)}" for arm, v in values.items()])
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def tested(values: dict[str, np.ndarray], arm: str, against: str) -> str:
-    """Welch's t-test in words."""
-    x, y = values[arm], values[against]
-    low, high = interval(lambda x, y, axis: mean(x, axis) - mean(y, axis), x, y)
-    difference, p = number(x.mean() - y.mean(), 3), welch(x, y)
-    words = f"{arm} minus {against} {difference}"
-    if math.isfinite(low):
-        words += f" (95 % interval {number(float(low), 3)} to {number(float(high), 3)})"
-    return words + (f", Welch's t-test p = {p:.2g}" if math.isfinite(p) else ", too few designs for a test")

@@ -12,6 +12,8 @@ from recipes.studies.ledger import Entry, State, in_csv
 
 SETTINGS = {
     "num_designs": 4,
+    "first_episodes": 2,
+    "episodes": 2,
     "num_runs": 1,
     "episode_steps": 10,
     "gamma": 0.9,

@@ -194,25 +194,3 @@ def test_a_folder_that_is_no_study_is_refused_in_a_sentence(tmp_path: Path) -> N
     with pytest.raises(SystemExit, match="is no study's folder: it has no cells/"):
         main([str(tmp_path)])
     assert list(tmp_path.iterdir()) == []
-
-
-RETRAINED = ["folder", "environment", "task", "arm", "seed", "run", "design", "xi", "found_return"]
-
-
-def test_figure_2_shows_the_best_return_of_each_retrained_design_and_welchs_test(study: Path) -> None:
-    best = {"none": [1, 2, 3], "known": [2, 4, 6, 8]}
-    lines = []
-    for arm, values in best.items():
-        for seed, value in enumerate(values):
-            name = f"hopper-forward-{arm}-{seed}-run0-design3"
-            lines.append([name, "hopper", "forward", arm, seed, 0, 3, "1 1", 30])
-            write_cell(study, name, [value], part="retrained/cells", num_designs=1)
-    lines.append(["not-yet", "hopper", "forward", "known", 9, 0, 3, "1 1", 30])
-    write_table(study / "retrained" / "designs.csv", RETRAINED, lines)
-    plot = next(plot for plot in write_figures(study) if plot.name == "figure_2_retrained")
-    rows = read_table(study / "figures" / "figure_2_retrained.csv")
-    for arm, values in best.items():
-        assert [float(row["best_return"]) for row in rows if row["arm"] == arm] == values
-    assert "7 of 8 designs are retrained, 0 of them diverged" in plot.caption
-    assert "known minus none 3 (95 % interval" in plot.caption
-    assert "Welch's t-test p = 0.1." in plot.caption  # t = 2.12 at 4.08 degrees of freedom

@@ -154,6 +154,7 @@ def test_designs_are_retrained_once_and_drawn(
     for row, line in zip(rows, chosen, strict=True):
         own = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
         assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
+        assert (row["episodes"], row["study_episodes"]) == ("2", TINY[TINY.index("--episodes") + 1])
 
 
 def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None:
