@@ -61,8 +61,7 @@ def archive(study: Path, target: Path) -> list[Path]:
     """
     if not (study / "cells").is_dir():
         raise ValueError(f"{study} is no study's folder: it has no cells/; name a folder that recipes.study wrote")
-    if target.resolve() == study.resolve():
-        raise ValueError(f"{target} is the study's own folder, name another one for its copy")
+    refuse_target(study, target)
     kept = [name for name in runs_in(study) if over(study / name)]
     if not kept:
         raise ValueError(f"no run of {study} is over yet; let the study go on")
@@ -79,6 +78,20 @@ def archive(study: Path, target: Path) -> list[Path]:
             (target / name).parent.mkdir(exist_ok=True)
             write_whole(target / name, only({folder.name for folder in kept}, study / name))
     return kept
+
+
+def refuse_target(study: Path, target: Path) -> None:
+    """Refuse to write over what is more than an archive.
+
+    Raises:
+        ValueError: if the target is in the study's own folder, is a study's folder itself, or no folder.
+    """
+    if target.resolve().is_relative_to(study.resolve()):
+        raise ValueError(f"{target} is in the study's own folder; name one outside of it")
+    if target.exists() and not target.is_dir():
+        raise ValueError(f"{target} is a file; name a folder")
+    if (target / "logs").exists() or any(target.glob("cells/*/checkpoint")):
+        raise ValueError(f"{target} is the folder of a study with checkpoints, no archive; name another one")
 
 
 def runs_in(study: Path) -> list[Path]:

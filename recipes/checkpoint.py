@@ -127,6 +127,20 @@ class Checkpoints:
         return notes
 
 
+def refuse_lost_checkpoints(folder: Path) -> None:
+    """Refuse to go on with a run that has rows and no checkpoint: it would begin anew over them.
+
+    Raises:
+        ValueError: as for a copy of its tables alone. A run makes a checkpoint before its first row.
+    """
+    rows = folder / "evaluations.csv"
+    if rows.is_file() and rows.read_bytes().count(b"\n") > 1 and not any((folder / "checkpoint").glob(f"{PREFIX}-*")):
+        raise ValueError(
+            f"{folder} has the tables of a run and no checkpoint/ to go on from; copy it there, or start a new run in "
+            "another folder"
+        )
+
+
 def parts(states: Mapping[str, Any], notes: dict[str, Any]) -> Checkpoint:
     """What a checkpoint consists of: states, and the generators that everybody shares."""
     return state_parts({**states, "random": GlobalRNGState()}, notes)

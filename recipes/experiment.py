@@ -32,7 +32,7 @@ from coim import (
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
 from recipes.best_policies import BestPolicies
-from recipes.checkpoint import Checkpoints
+from recipes.checkpoint import Checkpoints, refuse_lost_checkpoints
 from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
 from recipes.progress import Progress
@@ -96,6 +96,7 @@ def train(
         refuse_filled(folder)
     else:
         check_origin(folder, name)
+        refuse_lost_checkpoints(folder)
     if settings.compile:
         check_compiler()
     algorithm = make(folder, threads, side_by_side)

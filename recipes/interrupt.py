@@ -108,9 +108,9 @@ def locked(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("a+")
     except OSError as error:
+        first = "make it writable, or " if error.errno in READ_ONLY else ""
         raise OSError(
-            f"{folder} cannot be written to ({error.strerror}); make it writable, or name another folder for a new run "
-            "with --out"
+            f"{folder} cannot be written to ({error.strerror}); {first}name another folder for a new run with --out"
         ) from error
     with lock as file:
         try:

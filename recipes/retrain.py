@@ -33,7 +33,14 @@ from recipes.machine import available_cores
 from recipes.plots.runs import Place, Run, Runs, read_runs
 from recipes.reporting.records import Row
 from recipes.settings import saved_settings
-from recipes.studies.conduct import Conductor, Resources, ray_running, refuse_lack, take_up
+from recipes.studies.conduct import (
+    Conductor,
+    Resources,
+    ray_running,
+    refuse_lack,
+    take_up,
+    without_words_of_ray,
+)
 from recipes.studies.definition import Cell
 from recipes.writing import write_whole
 
@@ -111,18 +118,24 @@ def retrain(asked: Retrain) -> list[str]:
     runs = read_runs(asked.study)
     with locked(folder):
         cells = [cell_of(line, asked) for line in choose(runs, folder / "designs.csv", asked)]
-        ledger = take_up(folder, cells)
+        resources = Resources(gpus=asked.gpus)
+        try:
+            ledger = take_up(folder, cells, resources)
+        except ValueError as error:
+            raise ValueError(f"{error}; or move {folder} away to choose and train anew") from None
         waiting = len(ledger.in_state("waiting"))
         print(f"{waiting} of {len(cells)} designs to train -> {folder}")
         if not waiting:
             return []
         print(f"{episodes_in_words(cells)} training episodes on each{'' if asked.episodes else DEFAULT}")
         workers = asked.workers or available_cores()
-        # Ray takes SIGTERM for itself when it starts.
-        with ray_running(address=asked.ray_address, workers=workers), stopping_at_once():
-            resources = Resources(gpus=asked.gpus)
-            refuse_lack(resources, waits=asked.ray_address is not None)
-            return Conductor(folder, cells, ledger, resources).conduct()
+        with (
+            without_words_of_ray(folder) as terminal,
+            ray_running(address=asked.ray_address, workers=workers),
+            stopping_at_once(),  # Ray takes SIGTERM for itself when it starts
+        ):
+            refuse_lack(resources, terminal, waits=asked.ray_address is not None)
+            return Conductor(folder, cells, ledger, resources, terminal).conduct()
 
 
 def check(asked: Retrain) -> None:

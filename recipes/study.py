@@ -9,6 +9,7 @@ machine or, with ``--ray-address``, on a cluster whose nodes see the folder and 
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -17,9 +18,18 @@ from pathlib import Path
 import tyro
 
 from recipes.interrupt import Stopped, locked, stopping_at_once
-from recipes.machine import available_cores
-from recipes.studies.conduct import RETRIES, Conductor, Resources, ray_running, refuse_lack, take_up
-from recipes.studies.definition import Study, from_json, to_json
+from recipes.machine import available_cores, checked_device
+from recipes.studies.conduct import (
+    RETRIES,
+    Conductor,
+    Resources,
+    ray_running,
+    refuse_lack,
+    take_up,
+    without_words_of_ray,
+)
+from recipes.studies.definition import Cell, Study, from_json, to_json
+from recipes.studies.ledger import Ledger
 from recipes.studies.named import STUDIES
 from recipes.writing import write_whole
 
@@ -35,7 +45,8 @@ class Options:
     workers: int = 0
     """Cells at once on this machine; 0 takes as many as have cores."""
     ray_address: str | None = None
-    """A Ray cluster, such as auto or 10.0.0.1:6379; it decides how many cells go at once. By default this machine."""
+    """A Ray cluster, such as 10.0.0.1:6379; it decides how many cells go at once. By default this machine. auto takes
+    one that runs here, which may be that of another study and end with it."""
     cpus: int = 1
     """Cores of a cell, and threads that may be busy at once in it."""
     gpus: float = 0.0
@@ -47,21 +58,24 @@ def main(options: Options) -> None:
     check(options)
     study = find(options.study)
     folder = options.out or Path("runs") / f"study-{study.name}"
+    resources = Resources(options.cpus, options.gpus)
     workers = options.workers or max(1, available_cores() // options.cpus)
     try:
         with locked(folder), stopping_at_once():
             cells = study.cells()
-            ledger = take_up(folder, cells)
+            ledger = taken_up(folder, cells, resources)
             write_whole(folder / "study.json", to_json(study))
             waiting = len(ledger.in_state("waiting"))
             print(f"{study.name}: {waiting} of {len(cells)} cells to compute -> {folder}")
             if not waiting:
                 return
-            # Ray takes SIGTERM for itself when it starts.
-            with ray_running(address=options.ray_address, workers=workers, cpus=options.cpus), stopping_at_once():
-                resources = Resources(options.cpus, options.gpus)
-                refuse_lack(resources, waits=options.ray_address is not None)
-                failed = Conductor(folder, cells, ledger, resources).conduct()
+            with (
+                without_words_of_ray(folder) as terminal,
+                ray_running(address=options.ray_address, workers=workers, cpus=options.cpus),
+                stopping_at_once(),  # once more: Ray takes SIGTERM for itself when it starts
+            ):
+                refuse_lack(resources, terminal, waits=options.ray_address is not None)
+                failed = Conductor(folder, cells, ledger, resources, terminal).conduct()
     except Stopped as stop:
         print(f"\n{stop}; to go on: {command(options)}", file=sys.stderr)
         sys.exit(128 + stop.signum)
@@ -71,16 +85,38 @@ def main(options: Options) -> None:
         sys.exit("\n".join([f"failed, after {1 + RETRIES} tries each:", *told, again]))
 
 
+def taken_up(folder: Path, cells: list[Cell], resources: Resources) -> Ledger:
+    """The ledger of a study; what is refused is told with the options that are meant."""
+    try:
+        return take_up(folder, cells, resources)
+    except ValueError as error:
+        raise ValueError(f"{error} (the folder is --out, the device that of --gpus)") from None
+
+
 def check(options: Options) -> None:
     """Refuse by name what cannot be asked for."""
     if options.cpus < 1:
         raise ValueError(f"--cpus is {options.cpus}, a cell needs at least 1")
-    if options.gpus < 0:
+    if not 0 <= options.gpus < math.inf:
         raise ValueError(f"--gpus is {options.gpus}, a share is at least 0")
     if options.workers < 0:
         raise ValueError(f"--workers is {options.workers}, it must be at least 0 (0: as many as have cores)")
     if options.workers and options.ray_address is not None:
         raise ValueError("--workers is of this machine; a cluster decides itself, by --cpus and --gpus of each cell")
+    if options.ray_address is None:
+        check_machine(options)
+
+
+def check_machine(options: Options) -> None:
+    """Refuse what this machine has not."""
+    cores, asked = available_cores(), max(1, options.workers) * options.cpus
+    if asked > cores:
+        raise ValueError(
+            f"--workers x --cpus is {max(1, options.workers)} x {options.cpus}, this machine has {cores} core(s) for "
+            "us; ask for less, or leave both away"
+        )
+    if options.gpus > 0:
+        checked_device("cuda")
 
 
 def find(study: str) -> Study:

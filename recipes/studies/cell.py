@@ -11,6 +11,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from coim.envs import BODIES
+from recipes.checkpoint import refuse_lost_checkpoints
 from recipes.experiment import run
 from recipes.interrupt import LOCK
 from recipes.results import now
@@ -40,23 +41,37 @@ def compute(environment: str, settings: Settings, log: Path) -> None:
 
 
 def to_go_on(settings: Settings) -> Settings:
-    """The settings with which a cell is begun, or with which its run is resumed.
+    """The settings with which a cell is begun, or with which its run is resumed; makes room for one that begins.
 
     Raises:
-        ValueError: if it was begun with settings on which its past depends and which are others now.
+        ValueError: see `resumed`.
     """
     folder = settings.out
     if folder is None:
         raise ValueError("a cell has a folder")
+    if (going_on := resumed(settings, folder)) is not None:
+        return going_on
+    for path in folder.glob("*") if folder.exists() else []:
+        if path.name != LOCK:  # what a process that was killed at once had not finished
+            path.unlink()
+    return settings
+
+
+def resumed(settings: Settings, folder: Path) -> Settings | None:
+    """The settings with which a run goes on; None if it has not begun. Nothing is changed on disk.
+
+    Raises:
+        ValueError: if it was begun with settings on which its past depends and which are others now, or its folder has
+            rows and no checkpoint.
+    """
     if not (folder / "config.json").exists():
-        for path in folder.glob("*") if folder.exists() else []:
-            if path.name != LOCK:  # what a process that was killed at once had not finished
-                path.unlink()
-        return settings
+        return None
+    refuse_lost_checkpoints(folder)
     saved = saved_settings(folder)
-    resumed = dataclasses.replace(settings, out=saved.out, resume=folder)  # a study's folder may have been moved
-    refuse_changes(saved, resumed)
-    return resumed
+    # A study may have been moved, or given another name.
+    going_on = dataclasses.replace(settings, out=saved.out, name=saved.name, resume=folder)
+    refuse_changes(saved, going_on)
+    return going_on
 
 
 def still_finished(settings: Settings, folder: Path) -> bool:
@@ -95,6 +110,9 @@ def episodes_done(folder: Path, num_runs: int) -> int:
 
 
 def seconds_of(folder: Path) -> float:
-    """What a run took, by its own clock: of all the processes that computed at it."""
-    with (folder / "evaluations.csv").open(newline="") as file:
-        return max((float(row["seconds"]) for row in csv.DictReader(file)), default=0.0)
+    """What a run took, by its own clock: of all the processes that computed at it; 0 if its table is not there."""
+    try:
+        with (folder / "evaluations.csv").open(newline="") as file:
+            return max((float(row["seconds"]) for row in csv.DictReader(file)), default=0.0)
+    except OSError:  # a shared file system may show it later
+        return 0.0

@@ -11,13 +11,14 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import socket
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 
@@ -25,13 +26,14 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from recipes.settings import Settings, episodes_of
-from recipes.studies.cell import compute, episodes_done, seconds_of, still_finished, tries
+from recipes.studies.cell import compute, episodes_done, resumed, seconds_of, still_finished, tries
 from recipes.studies.definition import Cell
 from recipes.studies.ledger import Ledger
 
 RETRIES = 2  # of a cell that fails, and of one whose process dies
 CELLS = "cells"  # of a study's folder
 POLL = 0.5  # s between two looks at who has begun
+ANSWER = 5.0  # s to wait for a cluster
 OBJECT_STORE = 80 * 2**20  # bytes; what a cell makes is on disk, nothing goes through Ray
 
 
@@ -46,6 +48,7 @@ def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) 
     """
     common: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is not None:
+        refuse_silence(address)
         ray.init(address=address, **common)
         try:
             yield
@@ -66,6 +69,37 @@ def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) 
     finally:
         ray.shutdown()
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def without_words_of_ray(folder: Path) -> Iterator[TextIO]:
+    """Let Ray, which reports each death of a process at length, write to ``logs/ray.log`` in a study's folder.
+
+    Yields:
+        What was the standard output.
+    """
+    terminal, words = sys.stdout, folder / "logs" / "ray.log"
+    words.parent.mkdir(parents=True, exist_ok=True)
+    with words.open("a", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
+        yield terminal
+
+
+def refuse_silence(address: str) -> None:
+    """Say that nobody answers at HOST:PORT; Ray itself would try for minutes.
+
+    Raises:
+        ValueError: if nobody does.
+    """
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        return  # auto, or a form that Ray reads itself
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER).close()
+    except (OSError, OverflowError) as error:
+        raise ValueError(
+            f"no Ray cluster answers at {address} ({error}); start one with `ray start --head`, or leave --ray-address "
+            "away"
+        ) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,13 +123,14 @@ class Conductor:
         cells: of the study.
         ledger: of the study.
         resources: of each cell.
+        terminal: where its user reads.
     """
 
-    def __init__(self, folder: Path, cells: list[Cell], ledger: Ledger, resources: Resources) -> None:
+    def __init__(self, folder: Path, cells: list[Cell], ledger: Ledger, resources: Resources, terminal: TextIO) -> None:
         self.ledger, self.folder = ledger, folder.resolve()
         unfinished = set(ledger.in_state("waiting"))
         self.cells = [cell for cell in cells if cell.name in unfinished]
-        self.resources, self._terminal = resources, sys.stdout
+        self.resources, self._terminal = resources, terminal
         self._made_before = sum(self._episodes_done(cell) for cell in self.cells)
         self._started = time.monotonic()
 
@@ -109,11 +144,7 @@ class Conductor:
             KeyboardInterrupt: when told to end (see `recipes.interrupt.stopping_at_once`). All processes that compute
                 end at once: checkpoints are made for that.
         """
-        words = self.folder / "logs" / "ray.log"
-        words.parent.mkdir(parents=True, exist_ok=True)
-        # Ray reports each death of a process at length, in this process's own output.
-        with words.open("a", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
-            self._wait_for(self._submit())
+        self._wait_for(self._submit())
         return self.ledger.in_state("failed")
 
     def _submit(self) -> dict[ray.ObjectRef, Cell]:
@@ -124,7 +155,10 @@ class Conductor:
             max_retries=RETRIES,
             retry_exceptions=True,
         )(compute)
-        return {remote.remote(cell.environment, self.settings_of(cell), self.log_of(cell)): cell for cell in self.cells}
+        return {
+            remote.remote(cell.environment, settings_in(self.folder, cell, self.resources), self.log_of(cell)): cell
+            for cell in self.cells
+        }
 
     def _wait_for(self, running: dict[ray.ObjectRef, Cell]) -> None:
         try:
@@ -137,11 +171,6 @@ class Conductor:
             for reference in running:  # a cluster outlives this process
                 ray.cancel(reference, force=True)
             self.ledger.stop()
-
-    def settings_of(self, cell: Cell) -> Settings:
-        """Of a cell's run, its folder and this machine included."""
-        device = {"device": "cuda"} if self.resources.gpus else {}
-        return dataclasses.replace(cell.settings, out=self.folder_of(cell), threads=self.resources.cpus, **device)
 
     def folder_of(self, cell: Cell) -> Path:
         return self.folder / CELLS / cell.name
@@ -188,29 +217,42 @@ class Conductor:
         print(f"{time.strftime('%H:%M:%S')}  {cell.name}  {words}", file=self._terminal, flush=True)
 
 
-def take_up(folder: Path, cells: list[Cell]) -> Ledger:
+def settings_in(folder: Path, cell: Cell, resources: Resources) -> Settings:
+    """Of a cell's run, its folder and this machine included."""
+    device = {"device": "cuda"} if resources.gpus else {}
+    return dataclasses.replace(cell.settings, out=folder / CELLS / cell.name, threads=resources.cpus, **device)
+
+
+def take_up(folder: Path, cells: list[Cell], resources: Resources) -> Ledger:
     """The ledger of a study, in which what was finished waits again if it is gone or has more designs to try.
 
     Args:
-        folder: of the study.
+        folder: of the study; only its ledger is written, and that only if nothing is refused.
         cells: of the study.
+        resources: of each cell.
 
     Raises:
-        ValueError: if a finished cell was made with other settings than the study has now.
+        ValueError: if a cell that has begun or is finished was made with other settings than the study has now, or
+            cannot go on.
     """
     ledger = Ledger(folder / "ledger.csv", cells)
     for cell in cells:
-        finished = ledger.entries[cell.name].state == "finished"
-        if finished and not still_finished(cell.settings, folder / CELLS / cell.name):
-            ledger.note(cell.name, "waiting", seconds=None)
+        settings, entry = settings_in(folder, cell, resources), ledger.entries[cell.name]
+        own = folder / CELLS / cell.name
+        if entry.state == "finished" and still_finished(settings, own):
+            continue
+        resumed(settings, own)
+        ledger.entries[cell.name] = dataclasses.replace(entry, state="waiting", seconds=None)
+    ledger.write()
     return ledger
 
 
-def refuse_lack(resources: Resources, *, waits: bool) -> None:
+def refuse_lack(resources: Resources, terminal: TextIO, *, waits: bool) -> None:
     """Say what no node has, before cells wait for it.
 
     Args:
         resources: of each cell.
+        terminal: where its user reads.
         waits: whether a node that has them may still come.
 
     Raises:
@@ -219,7 +261,7 @@ def refuse_lack(resources: Resources, *, waits: bool) -> None:
     if lack := lacking(resources):
         if not waits:
             raise ValueError(f"{lack} here; ask for less")
-        print(f"{lack}; waiting for one", flush=True)
+        print(f"{lack}; waiting for one", file=terminal, flush=True)
 
 
 def lacking(resources: Resources) -> str:

@@ -45,11 +45,11 @@ class Ledger:
     """The rows of ``ledger.csv``; every change is on disk before the next line of the program.
 
     Args:
-        path: of the file. If it exists, what is finished stays so, and all else waits again.
+        path: of the file. If it exists, what is finished stays so, and all else waits again; nothing is written yet.
         cells: of the study, in the order in which they are computed.
 
     Raises:
-        ValueError: if the file knows of a cell that the study does not have.
+        ValueError: if the file is damaged, or knows of a cell that has begun and that the study does not have.
     """
 
     def __init__(self, path: Path, cells: Iterable[Cell]) -> None:
@@ -60,10 +60,13 @@ class Ledger:
         }
         for row in read_ledger(path):
             if row.cell not in self.entries:
-                raise ValueError(f"{path} has the cell {row.cell}, which this study has not; take another folder")
+                if row.tries == 0:
+                    continue  # of a larger study that never came to it
+                raise ValueError(
+                    f"{path} has the cell {row.cell}, which this study has not; name another folder with --out"
+                )
             state: State = "finished" if row.state == "finished" else "waiting"
             self.entries[row.cell] = dataclasses.replace(row, state=state)
-        self.write()
 
     def note(self, cell: str, state: State, **values: int | float | str | None) -> None:
         """Change a row."""
@@ -96,15 +99,22 @@ def in_csv(entries: Iterable[Entry]) -> str:
 
 
 def read_ledger(path: Path) -> list[Entry]:
-    """The rows of a ``ledger.csv``; none where there is no such file."""
+    """The rows of a ``ledger.csv``; none where there is no such file.
+
+    Raises:
+        ValueError: if it cannot be read as one.
+    """
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        return [
-            Entry(
-                **row
-                | {"seed": int(row["seed"]), "tries": int(row["tries"])}
-                | {"seconds": float(row["seconds"]) if row["seconds"] else None}
-            )
-            for row in csv.DictReader(file)
-        ]
+    try:
+        with path.open(newline="") as file:
+            return [
+                Entry(
+                    **row
+                    | {"seed": int(row["seed"]), "tries": int(row["tries"])}
+                    | {"seconds": float(row["seconds"]) if row["seconds"] else None}
+                )
+                for row in csv.DictReader(file)
+            ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({error}); delete it, and what is finished is found again") from None

@@ -10,7 +10,7 @@ import pytest
 from recipes.archive import main
 from recipes.figures import write_figures
 from recipes.settings import plain
-from recipes.studies.conduct import take_up
+from recipes.studies.conduct import Resources, take_up
 from recipes.studies.definition import Study
 from recipes.studies.ledger import Ledger
 from tests.recipes.made_up_study import read_table, write_cell, write_table
@@ -36,7 +36,7 @@ def study(tmp_path: Path) -> Path:
         settings = plain(cell.settings) | {"out": str(out)}
         write_cell(folder, cell.name, RETURNS[cell.name.removeprefix("hopper-forward-")], **settings)
         (out / "checkpoint").mkdir()
-    ledger = take_up(folder, STUDY.cells())
+    ledger = Ledger(folder / "ledger.csv", STUDY.cells())
     for cell in STUDY.cells():
         ledger.note(cell.name, "running" if cell.name == UNDER_WAY else "finished", tries=1, seconds=9.0)
     write_cell(folder, "hopper-forward-none-0-run0-design3", [1.5], part="retrained/cells", num_designs=1)
@@ -81,7 +81,7 @@ def test_nothing_of_the_machine_is_kept(study: Path, tmp_path: Path) -> None:
 
 def test_a_study_goes_on_from_its_archive_with_what_was_not_over(study: Path, tmp_path: Path) -> None:
     main([str(study), str(tmp_path / "kept")])
-    ledger = take_up(tmp_path / "kept", STUDY.cells())
+    ledger = take_up(tmp_path / "kept", STUDY.cells(), Resources())
     assert ledger.in_state("waiting") == [UNDER_WAY]
     assert not (tmp_path / "kept" / "cells" / UNDER_WAY).exists()
     assert ledger.entries[UNDER_WAY].tries == 0
@@ -122,12 +122,19 @@ def test_a_run_that_is_over_is_finished_whatever_the_ledger_says_and_a_message_i
 
 
 def test_what_cannot_be_kept_is_told(study: Path, tmp_path: Path) -> None:
+    other = write_cell(tmp_path / "other", "hopper-forward-none-0", [9] * 4).parents[1]
+    (other / "cells" / "hopper-forward-none-0" / "checkpoint").mkdir()
+    before = {path: path.read_bytes() for path in other.rglob("*.csv")}
+    (tmp_path / "file").touch()
     for where, target, sentence in (
         (tmp_path, tmp_path / "kept", "is no study's folder: it has no cells/"),
-        (study, study, "is the study's own folder"),
+        (study, study / "kept", "is in the study's own folder"),
+        (study, other, "is the folder of a study with checkpoints, no archive"),
+        (study, study / ".." / "file", "is a file; name a folder"),
     ):
         with pytest.raises(SystemExit, match=sentence):
             main([str(where), str(target)])
+    assert before == {path: path.read_bytes() for path in other.rglob("*.csv")}
     write_cell(tmp_path / "young", "hopper-forward-none-0", [1])
     with pytest.raises(SystemExit, match=r"no run of .*young is over yet"):
         main([str(tmp_path / "young"), str(tmp_path / "kept")])

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
-from interrupted_runs import TINY, cut
+from interrupted_runs import TINY, cut, resume
 
 from coim import EpisodeDone
 from coim.envs import BODIES
 from recipes.experiment import build
 from recipes.settings import Settings, plain
 from recipes.studies.cell import compute, episodes_done, seconds_of, to_go_on, tries
-from recipes.studies.conduct import all_episodes, in_words, take_up
+from recipes.studies.conduct import Resources, all_episodes, in_words, take_up
 from recipes.studies.definition import ARMS, PROTOCOLS, Block, Study, from_json, to_json
-from recipes.studies.ledger import Ledger, read_ledger
+from recipes.studies.ledger import Ledger, State, read_ledger
 from recipes.studies.named import STUDIES
+from recipes.study import entry
 
 
 def study(**fields: object) -> Study:
@@ -155,13 +157,13 @@ def finished_study(folder: Path, **fields: object) -> Study:
 def test_a_finished_cell_waits_again_if_it_is_gone_or_has_more_designs_to_try(tmp_path: Path) -> None:
     made = finished_study(tmp_path, overrides={"num_cells": (4,)})
     none, known = (cell.name for cell in made.cells())
-    assert take_up(tmp_path, made.cells()).in_state("finished") == [none, known]
+    assert take_up(tmp_path, made.cells(), Resources()).in_state("finished") == [none, known]
     (tmp_path / "cells" / known / "config.json").unlink()
     (tmp_path / "cells" / known).rmdir()
-    assert take_up(tmp_path, made.cells()).in_state("waiting") == [known]
+    assert take_up(tmp_path, made.cells(), Resources()).in_state("waiting") == [known]
     assert [row.state for row in read_ledger(tmp_path / "ledger.csv")] == ["finished", "waiting"]
     more = study(seeds=(3,), overrides={"num_cells": (4,), "num_designs": 9})
-    assert take_up(tmp_path, more.cells()).in_state("waiting") == [none, known]
+    assert take_up(tmp_path, more.cells(), Resources()).in_state("waiting") == [none, known]
 
 
 @pytest.mark.parametrize(
@@ -173,7 +175,69 @@ def test_a_finished_cell_of_another_protocol_is_not_compared_with_what_is_comput
 ) -> None:
     finished_study(tmp_path)
     with pytest.raises(ValueError, match=sentence):
-        take_up(tmp_path, study(overrides=overrides).cells())
+        take_up(tmp_path, study(overrides=overrides).cells(), Resources())
+
+
+@pytest.mark.parametrize("begun", ["finished", "waiting"])
+@pytest.mark.parametrize(
+    ("fields", "resources", "sentence"),
+    [
+        ({"overrides": {"lr": 0.1}, "seeds": (3, 4, 5)}, Resources(), r"other settings: lr \(0.0003 to 0.1\)"),
+        ({"name": "other", "seeds": (4,)}, Resources(), "none-3, which this study has not; name another folder"),
+        ({}, Resources(gpus=0.5), r"device \('cpu' to 'cuda'\)"),
+    ],
+)
+def test_a_study_that_is_refused_changes_nothing_and_the_right_one_goes_on(
+    tmp_path: Path, begun: State, fields: dict, resources: Resources, sentence: str
+) -> None:
+    made = finished_study(tmp_path)
+    for cell in made.cells():
+        Ledger(tmp_path / "ledger.csv", made.cells()).note(cell.name, begun, tries=1)
+    before = (tmp_path / "ledger.csv").read_bytes()
+    if resources.gpus and begun == "finished":
+        assert take_up(tmp_path, made.cells(), resources).in_state("waiting") == []  # wherever it was made
+        return
+    with pytest.raises(ValueError, match=sentence):
+        take_up(tmp_path, study(**fields).cells(), resources)
+    assert (tmp_path / "ledger.csv").read_bytes() == before
+    assert take_up(tmp_path, made.cells(), Resources()).in_state(begun) == [cell.name for cell in made.cells()]
+
+
+def test_a_study_may_be_called_otherwise_while_its_cells_are_under_way(tmp_path: Path) -> None:
+    made = finished_study(tmp_path)
+    (cell, *_) = study(name="called otherwise", seeds=(3,), overrides={"num_designs": 9}).cells()
+    own = tmp_path / "cells" / cell.name
+    going_on = to_go_on(dataclasses.replace(cell.settings, out=own))
+    assert (going_on.name, going_on.num_designs, going_on.resume) == (made.name, 9, own)
+
+
+def test_rows_of_a_larger_study_that_never_came_to_them_are_dropped_and_a_damaged_ledger_is_told(
+    tmp_path: Path,
+) -> None:
+    larger = Ledger(tmp_path / "ledger.csv", study(seeds=(3, 4)).cells())
+    larger.note("hopper-forward-none-3", "running", tries=1)
+    assert len(take_up(tmp_path, study(seeds=(3,)).cells(), Resources()).entries) == 2
+    assert len(read_ledger(tmp_path / "ledger.csv")) == 2
+    (tmp_path / "ledger.csv").write_text("cell,environment\nhopper-forward-none-3,hopper\n")
+    with pytest.raises(ValueError, match=r"ledger.csv is damaged .*delete it, and what is finished is found again"):
+        take_up(tmp_path, study(seeds=(3,)).cells(), Resources())
+
+
+def test_tables_without_a_checkpoint_are_not_begun_anew_over(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    cut(folder, 5)
+    shutil.rmtree(folder / "checkpoint")
+    rows = (folder / "evaluations.csv").read_bytes()
+    with pytest.raises(ValueError, match="has the tables of a run and no checkpoint/ to go on from"):
+        to_go_on(dataclasses.replace(TINY, out=folder))
+    with pytest.raises(SystemExit, match="has the tables of a run and no checkpoint/ to go on from"):
+        resume(folder)
+    assert (folder / "evaluations.csv").read_bytes() == rows
+
+
+def test_an_address_at_which_no_cluster_is_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"no Ray cluster answers at 127.0.0.1:1 .*or leave --ray-address away"):
+        entry(["smoke", "--out", str(tmp_path / "s"), "--ray-address", "127.0.0.1:1"])
 
 
 def test_a_ledger_grows_with_its_study(tmp_path: Path) -> None:

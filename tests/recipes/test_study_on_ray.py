@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from coim import HopperMorph
 from recipes.experiment import run as run_recipe
@@ -41,7 +42,7 @@ def conduct(folder: Path, what: Study) -> tuple[list[str], Ledger]:
     folder.mkdir(exist_ok=True)
     cells = what.cells()
     ledger = Ledger(folder / "ledger.csv", cells)
-    return Conductor(folder, cells, ledger, Resources()).conduct(), ledger
+    return Conductor(folder, cells, ledger, Resources(), sys.stdout).conduct(), ledger
 
 
 def meanwhile(folder: Path, cell: str, *, rows: int, act: Callable[[int], None]) -> threading.Thread:
@@ -212,6 +213,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
 @pytest.mark.usefixtures("cluster")
 def test_what_no_node_has_is_said_instead_of_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr("recipes.study.checked_device", torch.device)  # as if this machine had a GPU
     with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
         entry(["smoke", "--out", str(tmp_path / "s"), "--gpus", "0.5"])
     assert lacking(Resources(cpus=2)) == ""
@@ -225,6 +227,8 @@ def test_what_no_node_has_is_said_instead_of_waited_for(tmp_path: Path, monkeypa
         (["smoke", "--cpus", "0"], "--cpus is 0, a cell needs at least 1"),
         (["smoke", "--gpus", "-1"], "--gpus is -1"),
         (["smoke", "--workers", "-1"], "--workers is -1"),
+        (["smoke", "--gpus", "nan"], "--gpus is nan"),
+        (["smoke", "--cpus", "1000"], r"--workers x --cpus is 1 x 1000, this machine has \d+ core"),
         (["smoke", "--workers", "2", "--ray-address", "auto"], "a cluster decides itself"),
     ],
 )
