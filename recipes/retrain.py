@@ -1,10 +1,10 @@
 """Fig. 2: the best designs that each arm found, retrained from scratch: ``python -m recipes.retrain STUDY_FOLDER``.
 
-What an arm found are the designs that it chose by Eq. 5 (kind "optimised"), of all its seeds together: the first
-designs are given to every arm, and the random ones are nobody's merit. Its best half, by the best return in the study,
-is trained anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined. All arms of an
-environment and task keep the same share, also where the cap of --most makes it less: of more candidates an equal number
-would be a better selection, and the arm with more runs ahead without merit.
+What an arm found are the designs that it chose by Eq. 5 (kind "optimised"): the first designs are given to every arm,
+and the random ones are nobody's merit. The best half of those of each run, by the best return in the study, is trained
+anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined. Of each run, and not of all
+runs of an arm together: the few best of all come from few runs, and a test of arms takes their luck for the arm's (see
+`recipes.plots.retrained_pairs`).
 
 ``retrained/designs.csv`` in the study's folder names what was chosen; what stands there is not chosen again when the
 study grows, and says how many of the arm's runs were over by then, and how many of how many designs were kept. Beside
@@ -21,7 +21,7 @@ import math
 import signal
 import sys
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -58,9 +58,9 @@ class Retrain:
     arms: tuple[str, ...] = ("none", "known")
     """Whose designs."""
     top: float | None = None
-    """Share of an arm's optimised designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
+    """Share of each run's optimised designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
     most: int | None = None
-    """At most so many of each arm, environment and task; by default what was chosen by before, or 18 (Fig. 2)."""
+    """At most so many of each arm, environment and task, but one of each run; by default as before, or 18 (Fig. 2)."""
     episodes: int | None = None
     """Training episodes on each; by default as many as the study gave to a first design."""
     workers: int = 0
@@ -165,8 +165,8 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
             raise ValueError(f"{arm!r} is no arm of {asked.study}; name some of its own: --arms {' '.join(runs.arms)}")
     rule = rule_of(lines, asked)
     for place in runs.places:
-        there = {line["arm"]: line for line in lines if (line["environment"], line["task"]) == place}
-        lines += best_designs(runs, place, [arm for arm in asked.arms if arm not in there], rule, there.values())
+        there = {line["arm"] for line in lines if (line["environment"], line["task"]) == place}
+        lines += best_designs(runs, place, [arm for arm in asked.arms if arm not in there], rule)
     if not lines:
         raise ValueError(f"no run of {', '.join(asked.arms)} has an optimised design yet; let the study go on")
     text = io.StringIO()
@@ -196,34 +196,30 @@ def rule_of(lines: Sequence[Line], asked: Retrain) -> dict[str, float]:
     return rule
 
 
-def best_designs(
-    runs: Runs, place: Place, arms: Sequence[str], rule: Mapping[str, float], there: Iterable[Line] = ()
-) -> Iterator[Line]:
-    """The best share of what each arm found in one environment and task, best first.
+def best_designs(runs: Runs, place: Place, arms: Sequence[str], rule: Mapping[str, float]) -> Iterator[Line]:
+    """The best share of what each run of each arm found in one environment and task, best first.
 
     Args:
         runs: of the study.
         place: environment and task.
         arms: whose designs.
-        rule: ``top`` and ``most``.
-        there: a line of each arm that was chosen from before; with the largest of all the cap is turned into a share.
+        rule: ``top``, the share, and ``most``, which is divided among the runs of the arm that has most of them, so
+            that all arms select alike.
     """
-    found = {arm: candidates(runs, place, arm) for arm in arms}
-    largest = max([*map(len, found.values()), *(int(line["found"]) for line in there if line.get("found"))], default=0)
-    if not largest:
-        return
-    share = min(Fraction(str(rule["top"])), Fraction(int(rule["most"]), largest))
-    for arm, pairs in found.items():
-        kept = math.ceil(share * len(pairs))
+    most_of_run = max(1, int(rule["most"]) // max(runs.planned[*place, arm] for arm in runs.arms_at(place)))
+    share = Fraction(str(rule["top"]))  # 7 / 25 * 25 > 7 in floating point
+    for arm in arms:
+        found = [candidates(run) for run in runs.of(place, arm)]
+        kept = [pair for own in found for pair in own[: min(most_of_run, math.ceil(share * len(own)))]]
         noted = {"over": sum(run.over for run in runs.of(place, arm)), "planned": runs.planned[*place, arm]}
-        noted |= {"found": len(pairs), "kept": kept, **rule}
-        for run, row in pairs[:kept]:
+        noted |= {"found": sum(map(len, found)), "kept": len(kept), **rule}
+        for run, row in sorted(kept, key=lambda pair: -pair[1]["best_return"]):
             yield line_of(run, row) | {name: str(value) for name, value in noted.items()}
 
 
-def candidates(runs: Runs, place: Place, arm: str) -> list[tuple[Run, Row]]:
+def candidates(run: Run) -> list[tuple[Run, Row]]:
     """Designs that Eq. 5 chose, best first."""
-    found = [(run, row) for run in runs.of(place, arm) for row in run.designs if row["kind"] == "optimised"]
+    found = [(run, row) for row in run.designs if row["kind"] == "optimised"]
     return sorted(found, key=lambda pair: -pair[1]["best_return"])
 
 

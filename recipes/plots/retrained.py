@@ -112,7 +112,7 @@ def caption(rows: Sequence[Cells], listed: Sequence[Line], lost: int) -> str:
     diverged, replaced = (sum(bool(row[name]) for row in rows) for name in ("diverged", "replaced"))
     words = (
         f"Highest return of the deterministic policy of plain SAC in {episodes} training episodes from scratch on each "
-        "of the best designs that Eq. 5 chose in each arm, by their return in the study, where such a design had "
+        "of the best designs that Eq. 5 chose in each run, by their return in the study, where such a design had "
         f"{in_study} episodes; first and random designs are left out, even where they were better. Boxes: quartiles "
         "and median; whiskers: all designs; points: designs, each with a seed of its own, also where a body comes "
         f"again. {len(rows) + lost} of {len(listed)} designs are retrained, {diverged + lost} of them diverged"
@@ -148,13 +148,18 @@ def origin(arm: str, designs: Sequence[Cells]) -> str:
     if not first["found"]:
         return words
     found, kept = int(str(first["found"])), int(str(first["kept"]))
-    return f"{words}, chosen as the best {kept} of {found} ({100 * kept / found:.0f} %)"
+    return f"{words}, chosen as the best of each run, {kept} of {found} ({100 * kept / found:.0f} %)"
 
 
 def unequal(own: dict[str, list[Cells]]) -> bool:
-    """Whether no one share, rounded up to whole designs, gives the number that was kept of each arm."""
-    counts = [(int(str(rows[0]["kept"])), int(str(rows[0]["found"]))) for rows in own.values() if rows[0]["found"]]
-    return bool(counts) and max((kept - 1) / found for kept, found in counts) >= min(k / f for k, f in counts)
+    """Whether no one share, rounded up to whole designs of each run, gives the number that was kept of each arm."""
+    counts = [
+        (int(str(rows[0]["kept"])), int(str(rows[0]["found"])), sizes(rows)["runs"])
+        for rows in own.values()
+        if rows[0]["found"]
+    ]
+    least = min((kept / found for kept, found, _ in counts), default=math.inf)
+    return any((kept - runs) / found >= least for kept, found, runs in counts)
 
 
 def compared(row: Cells) -> str:

@@ -31,7 +31,8 @@ def write_cell(
     name: str,
     /,
     *runs: Sequence[float],
-    predicted: Sequence[float | None] = (None, 1.0, 2.0, 3.0),
+    kinds: Sequence[str] = KINDS,
+    predicted: Sequence[float | None] = (None, 1.0, 2.0, 3.0, 4.0, 5.0),
     diverged: Sequence[int] = (),
     part: str = "cells",
     **settings: object,
@@ -42,6 +43,7 @@ def write_cell(
         study: its folder.
         name: of the cell.
         runs: the best return of each design of each run; fewer than ``num_designs`` are a run under way.
+        kinds: of each design.
         predicted: Q(xi) of each design.
         diverged: runs that diverged on the last design they have.
         part: of the study's folder.
@@ -54,7 +56,7 @@ def write_cell(
     episodes, designs = [], []
     for run, returns in enumerate(runs):
         for index, best in enumerate(returns):
-            place = [run, index + 1, KINDS[index], 0.5 + index / 4, 1.0]
+            place = [run, index + 1, kinds[index], 0.5 + index / 4, 1.0]
             last = "design 3, episode 2" if run in diverged and index + 1 == len(returns) else ""
             for episode, value in enumerate((best - 1, best)):  # the best comes second
                 steps = (2 * index + episode + 1) * 10

@@ -14,64 +14,71 @@ from recipes.figures import write_figures
 from recipes.plots.runs import read_runs
 from recipes.retrain import Retrain, best_designs, cell_of, choose, episodes_in_words, main
 from recipes.settings import Settings, parse, plain
-from tests.recipes.made_up_study import KINDS, read_table, write_cell
+from tests.recipes.made_up_study import read_table, write_cell
 from tests.recipes.test_experiment import TINY
 
 PLACE = ("hopper", "forward")
 
 
-@pytest.fixture
-def study(tmp_path: Path) -> Path:
-    """One optimised design each, with best returns 33, 31, ... 25 of "known" and 5, 6 of "none"."""
-    for seed, best in enumerate((31, 27, 33, 25, 29)):
-        write_cell(tmp_path, f"hopper-forward-known-{seed}", [90, 20, best, 80])
-    write_cell(tmp_path, "hopper-forward-none-0", [90, 20, 5, 80], [90, 20, 6, 80])
-    return tmp_path
-
-
+KINDS = ("first", "optimised", "random", "optimised", "optimised")
 RULE = {"top": 0.5, "most": 18}
 
 
-def test_the_best_half_is_of_the_designs_that_eq_5_chose_from_all_seeds_together(study: Path) -> None:
-    assert KINDS[2] == "optimised"
+def found(study: Path, cell: str, *runs: tuple[float, float, float]) -> None:
+    """A cell with three designs in each run that Eq. 5 chose, between better ones that it did not."""
+    returns = ([90, one, 80, other, third] for one, other, third in runs)
+    write_cell(study, cell, *returns, kinds=KINDS, num_designs=5)
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Three runs of "known" and two, of one cell, of "none"."""
+    found(tmp_path, "hopper-forward-known-0", (31, 27, 33))
+    found(tmp_path, "hopper-forward-known-1", (5, 7, 6))
+    found(tmp_path, "hopper-forward-known-2", (20, 28, 10))
+    found(tmp_path, "hopper-forward-none-0", (1, 2, 3), (6, 5, 4))
+    return tmp_path
+
+
+def test_the_best_half_is_of_the_designs_that_eq_5_chose_in_each_run(study: Path) -> None:
     runs = read_runs(study)
-    found = list(best_designs(runs, PLACE, ["known"], RULE))
-    assert [line["found_return"] for line in found] == ["33", "31", "29"]  # half of five, rounded up
-    assert found[0]["folder"] == "hopper-forward-known-2-run0-design3"
-    assert found[0]["xi"] == "1 1"
-    assert {(line["found"], line["kept"], line["top"], line["most"]) for line in found} == {("5", "3", "0.5", "18")}
-    assert [line["run"] for line in best_designs(runs, PLACE, ["none"], RULE)] == ["1"]
-    most = list(best_designs(runs, PLACE, ["known"], {"top": 1.0, "most": 2}))
-    assert [line["found_return"] for line in most] == ["33", "31"]
+    lines = list(best_designs(runs, PLACE, ["known"], RULE))
+    # Half of three, rounded up, of each run: not the best five of all together, of which 6 and 7 would not be.
+    assert [line["found_return"] for line in lines] == ["33", "31", "28", "20", "7", "6"]
+    assert lines[0]["folder"] == "hopper-forward-known-0-run0-design5"
+    assert lines[0]["xi"] == "1.5 1"
+    assert {(line["found"], line["kept"], line["top"], line["most"]) for line in lines} == {("9", "6", "0.5", "18")}
+    of_none = list(best_designs(runs, PLACE, ["none"], RULE))
+    assert [(line["run"], line["found_return"]) for line in of_none] == [("1", "6"), ("1", "5"), ("0", "3"), ("0", "2")]
+    assert len(list(best_designs(runs, PLACE, ["none"], {"top": 1.0, "most": 18}))) == 6
 
 
-def test_the_cap_takes_the_same_share_of_an_arm_with_more_designs_and_of_one_with_less(tmp_path: Path) -> None:
-    for arm, count in (("none", 12), ("known", 6)):
-        write_cell(tmp_path, f"hopper-forward-{arm}-0", *([90, 20, best, 80] for best in range(count)))
-    runs = read_runs(tmp_path)
-    rule = {"top": 0.5, "most": 4}
-    together = list(best_designs(runs, PLACE, ["none", "known"], rule))
-    assert [line["arm"] for line in together] == ["none"] * 4 + ["known"] * 2  # a third of each
-    assert [line["found_return"] for line in together if line["arm"] == "known"] == ["5", "4"]
-    later = list(best_designs(runs, PLACE, ["known"], rule, there=together[:1]))
-    assert later == together[4:]
-    thirds = list(best_designs(runs, PLACE, ["none"], {"top": 0.1, "most": 4}))
-    assert len(thirds) == 2  # 1.2, rounded up
+def test_the_cap_takes_as_many_of_each_run_in_all_arms_and_at_least_one(study: Path) -> None:
+    runs = read_runs(study)
+    for most, of_known in ((3, 3), (5, 3), (6, 6), (2, 3)):
+        rule = {"top": 1.0, "most": most}
+        together = list(best_designs(runs, PLACE, ["none", "known"], rule))
+        assert [line["arm"] for line in together] == ["none"] * (of_known * 2 // 3) + ["known"] * of_known
+        assert list(best_designs(runs, PLACE, ["known"], rule)) == together[-of_known:]  # whoever is chosen with it
 
 
-def test_the_cap_is_kept_to_the_last_bit(tmp_path: Path) -> None:
-    write_cell(tmp_path, "hopper-forward-known-0", *([90, 20, best, 80] for best in range(25)))
+def test_a_share_of_whole_designs_is_not_rounded_up(tmp_path: Path) -> None:
+    count = 25
+    write_cell(
+        tmp_path, "hopper-forward-known-0", range(count), kinds=["optimised"] * count, predicted=range(count),
+        num_designs=count,
+    )  # fmt: skip
     assert 7 / 25 * 25 > 7  # rounded up, it would be eight
-    assert len(list(best_designs(read_runs(tmp_path), PLACE, ["known"], {"top": 0.5, "most": 7}))) == 7
+    assert len(list(best_designs(read_runs(tmp_path), PLACE, ["known"], {"top": 7 / 25, "most": 18}))) == 7
 
 
 def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study: Path) -> None:
     path = study / "chosen.csv"
     first = choose(read_runs(study), path, Retrain(study=study, arms=("known",)))
-    write_cell(study, "hopper-forward-known-7", [90, 20, 99, 80])
+    found(study, "hopper-forward-known-7", (99, 98, 97))
     both = choose(read_runs(study), path, Retrain(study=study))
-    assert both[:3] == first
-    assert [line["arm"] for line in both[3:]] == ["none"]
+    assert both[:6] == first
+    assert [line["arm"] for line in both[6:]] == ["none"] * 4
     assert read_table(path) == both
 
 
@@ -93,8 +100,8 @@ def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Pat
     assert path.read_bytes() == before
     lines = choose(runs, path, Retrain(study=study, top=0.7))  # the same, and one that is left out
     assert [(line["arm"], line["found"], line["kept"]) for line in lines] == [
-        *[("known", "5", "3")] * 3,
-        *[("none", "2", "2")] * 2,  # 3/5 of two, rounded up
+        *[("known", "9", "3")] * 3,
+        *[("none", "6", "2")] * 2,
     ]
     assert {(line["top"], line["most"]) for line in lines} == {("0.7", "3")}
 
@@ -108,15 +115,15 @@ def settings_of(study: Path, cell: str, **values: object) -> Settings:
 
 
 def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_one_body(study: Path) -> None:
-    cell = "hopper-forward-known-2"
+    cell = "hopper-forward-known-0"
     settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
-    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))
+    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
     own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
     assert (own.designs, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
     assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
-    assert (own.first_design, own.first_episodes) == ((1, 1), 9)
+    assert (own.first_design, own.first_episodes) == ((0.75, 1), 9)
     assert (own.lr, own.batch_size, own.individual_updates) == (0.001, settings.batch_size, settings.individual_updates)
-    settings_of(study, "hopper-forward-known-0")
+    settings_of(study, "hopper-forward-known-2")
     other = cell_of(lines[1], Retrain(study=study)).settings
     assert own.seed != other.seed
     assert other.first_episodes == settings.first_episodes
@@ -160,7 +167,7 @@ def test_designs_are_retrained_once_and_drawn(
 def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None:
     for seed in (2, 0):
         settings_of(study, f"hopper-forward-known-{seed}", first_episodes=300 + seed)
-    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[:2]
+    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
     assert episodes_in_words([cell_of(line, Retrain(study=study)) for line in lines]) == "300 or 302"
     assert episodes_in_words([cell_of(line, Retrain(study=study, episodes=9)) for line in lines]) == "9"
 

@@ -90,7 +90,9 @@ def test_each_arm_says_how_many_designs_bodies_and_runs_it_has(tmp_path: Path) -
     write_retrained(tmp_path, {"none": of_seeds(1), "known": known}, found=50, kept=4)
     designs, tests = drawn(tmp_path)
     assert [designs.rows[-1][f"arm_{name}"] for name in ("designs", "bodies", "runs")] == [4, 2, 2]
-    assert "known: 4 designs, distinct bodies 2, runs 2, chosen as the best 4 of 50 (8 %)" in designs.caption
+    assert (
+        "known: 4 designs, distinct bodies 2, runs 2, chosen as the best of each run, 4 of 50 (8 %)" in designs.caption
+    )
     (row,) = tests.rows
     assert [row[name] for name in ("designs", "bodies", "runs")] == [4, 2, 2]
     assert [row[f"{name}_against"] for name in ("designs", "bodies", "runs")] == [1, 1, 1]
