@@ -39,9 +39,11 @@ class Measured:
             step; see `predictions`.
         bias_random: the same over random designs.
         hours: wall-clock of the cell.
+        episode_seconds: median over the training episodes, their updates and evaluation included; NaN without a
+            ``metrics.csv``.
         updates: of all learners and the ensemble.
 
-    All but the last two are NaN while they are not known; area and final while the run is under way.
+    All but the last three are NaN while they are not known; area and final while the run is under way.
     """
 
     run: Run
@@ -52,6 +54,7 @@ class Measured:
     bias_optimised: float
     bias_random: float
     hours: float
+    episode_seconds: float
     updates: int
 
 
@@ -74,6 +77,7 @@ def measure(run: Run, failure: float) -> Measured:
         bias_optimised=bias([row for row in chosen if row["kind"] == "optimised"]),
         bias_random=bias([row for row in chosen if row["kind"] == "random"]),
         hours=max(row["seconds"] for row in run.record.episodes) / 3600,
+        episode_seconds=float(np.median([row.get("seconds/episode", math.nan) for row in rows])),
         updates=len(rows) * an_episode,
     )
 

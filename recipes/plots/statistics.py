@@ -179,6 +179,7 @@ OF_RUN = (
     "bias_optimised",
     "bias_random",
     "hours",
+    "episode_seconds",
     "updates",
 )
 PREDICTED = ("design", "kind", "predicted", "best_return", "predicted_per_step", "return_per_step")
@@ -209,7 +210,8 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
         axes.set_ylim(0, 1.1 * max(getattr(m, name) for m in here))
     caption = (
         "What every run took, also those under way: wall-clock of its cell, whatever else the machine did meanwhile, "
-        f"and updates of both learners and the ensemble together. {runs.in_words(runs.arms)}"
+        "and updates of both learners and the ensemble together. episode_seconds: the median over its episodes, with "
+        f"their updates and evaluation. {runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_runs", figure=figure, rows=rows, caption=caption)
 

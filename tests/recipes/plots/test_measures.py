@@ -26,6 +26,16 @@ def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> 
     assert found.bias_random == pytest.approx(0.3 - 3)
     assert found.hours == pytest.approx(8 * 36 / 3600)
     assert found.updates == 8 * (5 + 3 + 2)
+    assert math.isnan(found.episode_seconds)
+
+
+def test_the_seconds_of_an_episode_are_the_median_of_those_in_its_metrics(tmp_path: Path) -> None:
+    folder = write_cell(tmp_path, "hopper-forward-known-0", [10, 40])
+    places = [(0, design, episode) for design in (1, 2) for episode in (1, 2)]
+    rows = [[*place, seconds] for place, seconds in zip(places, (90.0, 3.0, 5.0, 4.0), strict=True)]
+    write_table(folder / "metrics.csv", ["run", "design", "episode", "seconds/episode"], rows)
+    (run,) = read_runs(tmp_path).found
+    assert measure(run, failure=0).episode_seconds == 4.5
 
 
 def rows_of(*lines: tuple[int, float, float]) -> list[Row]:
