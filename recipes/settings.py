@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
+from coim.batches import batch_parts
 from coim.saved_run import read_config
+from recipes.kinds import Interval, fitted, kinds_of, refuse_outside
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -141,10 +142,22 @@ QUICK = Settings(
 
 # What may differ when a run is gone on with, because no number of its past depends on it.
 FREE = {"num_designs", "threads", "checkpoint_every", "resume", "wandb", "quiet"}
-# Counts that the parts refuse in their own words, or not at all; here by the option's name.
-LEAST = dict.fromkeys(
-    ("num_runs", "first_episodes", "episodes", "num_critics", "num_members", "checkpoint_every"), 1
-) | {"seed": 0, "threads": 0}
+# What the parts of a run refuse in their own words, or not at all; here by the option's name and before there is a run.
+ALLOWED: dict[Interval, tuple[str, ...]] = {
+    Interval(1): (
+        *("num_runs", "num_designs", "first_episodes", "episodes", "episode_steps", "batch_size", "checkpoint_every"),
+        *("num_cells", "num_critics", "model_cells", "num_members"),
+        *("num_particles", "num_iterations", "num_start_states"),
+    ),
+    Interval(0): (
+        *("individual_updates", "population_updates", "model_updates", "seed", "threads"),
+        *("sigma", "alpha", "weight_decay"),
+    ),
+    Interval(0, 1): ("gamma", "individual_mix", "imagined_share", "individual_imagined_share"),
+    Interval(0, 1, above=True): ("tau",),
+    Interval(0, above=True): ("first_design", "lr", "model_lr"),
+}
+LIMITS = {name: allowed for allowed, names in ALLOWED.items() for name in names}
 PRESETS = {"paper": Settings(compile=True), "quick": QUICK}
 
 
@@ -168,16 +181,44 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
     if known.resume is not None:
         default = saved_settings(known.resume)
     settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
-    if not 0 <= settings.sigma < math.inf:
-        first.error(f"--sigma is {settings.sigma}, a standard deviation is a finite number of at least 0")
-    if settings.dream == "simulator" and settings.designs == "none":
-        first.error("--dream simulator has nothing to imagine with --designs none; take known, noisy or random")
-    for name, least in LEAST.items():
-        if (value := getattr(settings, name)) < least:
-            first.error(f"--{name.replace('_', '-')} is {value}, it must be at least {least}")
+    try:
+        check(settings, called=lambda name: f"--{name.replace('_', '-')}")
+    except ValueError as error:
+        first.error(str(error))
     if known.resume is not None:
         refuse_changes(default, settings)
     return settings
+
+
+def check(settings: Settings, *, called: Callable[[str], str] = str) -> None:
+    """Refuse values that no run can have, whatever its body and its machine.
+
+    Args:
+        settings: of a run.
+        called: from a setting's name to what it is called where somebody wrote it.
+
+    Raises:
+        ValueError: on the first one, with its value and what it must be.
+
+    Example:
+        >>> check(Settings(episodes=0))
+        Traceback (most recent call last):
+        ValueError: episodes is 0, it must be at least 1
+    """
+    for name, kind in kinds_of(Settings).items():
+        value = fitted(called(name), getattr(settings, name), kind)
+        if name in LIMITS:
+            refuse_outside(called(name), value, LIMITS[name])
+    for name in ("num_cells", "model_cells"):
+        if not getattr(settings, name):
+            raise ValueError(f"{called(name)} is empty, it must have at least one number; the defaults have three")
+    if settings.dream == "simulator" and settings.designs == "none":
+        raise ValueError(
+            f"{called('dream')} simulator has nothing to imagine with {called('designs')} none; take known, noisy or "
+            "random"
+        )
+    batch_parts(settings.batch_size, imagined=settings.imagined_share)
+    batch_parts(settings.batch_size, imagined=settings.individual_imagined_share, other=settings.individual_mix)
 
 
 def plain(settings: Settings) -> dict[str, Any]:

@@ -1,0 +1,90 @@
+"""Values that no run can have are refused by the name of their setting."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from recipes.kinds import kinds_of
+from recipes.settings import LIMITS, PRESETS, Settings, check, parse
+from recipes.studies.definition import PROTOCOLS
+
+WRONG: list[tuple[str, Any, str]] = [
+    ("search", "foo", "search is 'foo', it must be one of swarm, gradient"),
+    ("predict", "Delta", "predict is 'Delta', it must be one of delta, next"),
+    ("mix", "sums", "mix is 'sums', it must be one of batch, sum"),
+    ("wandb", "onlin", "wandb is 'onlin', it must be one of off, offline, online"),
+    ("episodes", "20", "episodes is '20', it must be a whole number"),
+    ("episodes", 2.5, "episodes is 2.5, it must be a whole number"),
+    ("episodes", None, "episodes is None, it must be a whole number"),
+    ("individual_updates", True, "individual_updates is True, it must be a whole number"),
+    ("individual_updates", -1, "individual_updates is -1, it must be at least 0"),
+    ("compile", "yes", "compile is 'yes', it must be true or false"),
+    ("compile", 1, "compile is 1, it must be true or false"),
+    ("device", 0, "device is 0, it must be a string"),
+    ("num_cells", 4, "num_cells is 4, it must be a list of whole numbers"),
+    ("num_cells", (8, 0), "num_cells is (8, 0), each must be at least 1"),
+    ("num_cells", (8, 0.5), "num_cells is (8, 0.5), it must be a list of whole numbers"),
+    ("num_cells", (), "num_cells is empty, it must have at least one number"),
+    ("model_cells", (), "model_cells is empty"),
+    ("lr", "fast", "lr is 'fast', it must be a finite number"),
+    ("lr", True, "lr is True, it must be a finite number"),
+    ("lr", float("inf"), "lr is inf, it must be a finite number"),
+    ("lr", 10**400, "it must be a finite number"),
+    ("lr", 0, "lr is 0.0, it must be above 0"),
+    ("model_lr", -1, "model_lr is -1.0, it must be above 0"),
+    ("gamma", 1.01, "gamma is 1.01, it must lie in [0, 1]"),
+    ("tau", 0, "tau is 0.0, it must lie in (0, 1]"),
+    ("imagined_share", -0.1, "imagined_share is -0.1, it must lie in [0, 1]"),
+    ("individual_mix", 0.999, "a batch of 256 rows is smaller than its parts"),
+    ("checkpoint_every", 0, "checkpoint_every is 0, it must be at least 1"),
+    ("num_designs", 0, "num_designs is 0, it must be at least 1"),
+    ("first_design", (1, -1), "first_design is (1.0, -1.0), each must be above 0"),
+    ("sigma", -1, "sigma is -1.0, it must be at least 0"),
+    ("dream", "simulator", "dream simulator has nothing to imagine with designs none; take known, noisy or random"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "sentence"), WRONG)
+def test_a_value_that_no_run_can_have_is_named_with_what_it_must_be(name: str, value: object, sentence: str) -> None:
+    fields: dict[str, Any] = {"designs": "none", name: value}
+    with pytest.raises(ValueError) as refused:  # noqa: PT011
+        check(Settings(**fields))
+    assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize("settings", [*PRESETS.values(), *PROTOCOLS.values()])
+def test_what_is_written_here_is_allowed(settings: Settings) -> None:
+    check(settings)
+
+
+def test_the_ends_of_what_is_allowed_are_allowed() -> None:
+    settings = Settings(gamma=1, tau=1, alpha=0, sigma=0, weight_decay=0, imagined_share=0, individual_mix=1)
+    check(dataclasses.replace(settings, individual_updates=0, population_updates=0, model_updates=0, num_cells=(1,)))
+
+
+def test_no_number_is_without_a_limit() -> None:
+    numbers = {name for name, kind in kinds_of(Settings).items() if kind in (int, float) or "tuple" in str(kind)}
+    assert numbers == LIMITS.keys()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--num-cells", "8", "0"], "error: --num-cells is (8, 0), each must be at least 1\n"),
+        (["--individual-imagined-share", "2"], "error: --individual-imagined-share is 2.0, it must lie in [0, 1]\n"),
+        (
+            ["--dream", "simulator", "--designs", "none"],
+            "error: --dream simulator has nothing to imagine with --designs none; take known, noisy or random\n",
+        ),
+    ],
+)
+def test_the_command_line_calls_a_setting_by_its_option(
+    capsys: pytest.CaptureFixture, options: list[str], sentence: str
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        parse("prog", "", options)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.endswith(sentence)
