@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from coim.envs import BODIES
-from recipes.settings import PRESETS, Settings
+from recipes.kinds import Interval, fitted, kinds_of, refuse_outside
+from recipes.settings import LIMITS, PRESETS, Settings, check
 
 # What is compared. All arms of a seed share the first designs, the initial weights and the reset noise.
 ARMS: dict[str, dict[str, Any]] = {
@@ -74,6 +76,14 @@ class Block:
     """Settings that differ from the protocol's; those of a study hold in all of its blocks."""
 
     def __post_init__(self) -> None:
+        for name, kind in kinds_of(type(self)).items():
+            fitted(name, getattr(self, name), kind)
+        for name in ("environments", "tasks", "arms", "seeds"):
+            if not (values := getattr(self, name)):
+                raise ValueError(f"{name} is empty, and nothing is to be computed then; name at least one of them")
+            if twice := sorted({value for value in values if values.count(value) > 1}):
+                raise ValueError(f"{name} has {', '.join(map(repr, twice))} more than once; name each of them once")
+        refuse_outside("seeds", tuple(self.seeds), LIMITS["seed"])
         known: dict[str, Collection[str]] = {"environments": BODIES, "arms": ARMS, "tasks": ("forward", "backward")}
         for name, choices in known.items():
             for value in getattr(self, name):
@@ -92,7 +102,7 @@ class Study(Block):
     """A block, and more of them where not everything is combined with everything.
 
     Raises:
-        ValueError: if a name is not known, or a cell comes twice.
+        ValueError: if a name is not known, a seed comes twice, or a cell has settings that no run can have.
 
     Example:
         >>> study = Study(name="tiny", environments=("hopper",), arms=("none", "known"), seeds=(0, 1), protocol="smoke")
@@ -111,13 +121,17 @@ class Study(Block):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol {self.protocol!r} is none of {', '.join(PROTOCOLS)}")
-        if self.seeds_per_cell < 1:
-            raise ValueError(f"seeds_per_cell is {self.seeds_per_cell}, it must be at least 1")
-        names = [cell.name for cell in self.cells()]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        refuse_outside("seeds_per_cell", self.seeds_per_cell, Interval(1))
+        names = [
+            "-".join(map(str, place))
+            for block in (self, *self.blocks)
+            for place in itertools.product(block.environments, block.tasks, block.arms, block.seeds)
+        ]
+        if twice := sorted(name for name, times in Counter(names).items() if times > 1):
             raise ValueError(f"{', '.join(twice)} would be made twice; take it out of all but one block")
+        for cell in self.cells():
+            check(cell.settings)
+            refuse_unbuildable(cell)
 
     def cells(self) -> list[Cell]:
         """The runs of this study: one seed of every arm before the next, so that what there is can be compared."""
@@ -126,12 +140,16 @@ class Study(Block):
         return sorted(cells, key=lambda cell: cell.position)  # stable: within a position in the order of the blocks
 
     def _cells_of(self, block: Block) -> Iterator[Cell]:
+        kinds = kinds_of(Settings)
+        overrides = {
+            name: fitted(name, value, kinds[name]) for name, value in {**self.overrides, **block.overrides}.items()
+        }
         for position in range(0, len(block.seeds), self.seeds_per_cell):
             seeds = block.seeds[position : position + self.seeds_per_cell]
             for environment, task, arm in itertools.product(block.environments, block.tasks, block.arms):
                 settings = dataclasses.replace(
                     PROTOCOLS[self.protocol],
-                    **_typed({**self.overrides, **block.overrides}) | ARMS[arm],
+                    **overrides | ARMS[arm],
                     task=task,
                     seed=seeds[0],
                     num_runs=len(seeds),
@@ -163,9 +181,19 @@ class Cell:
         return f"{self.environment}-{self.settings.task}-{self.arm}-{self.settings.seed}"
 
 
-def _typed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values from JSON as `Settings` has them."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+def refuse_unbuildable(cell: Cell) -> None:
+    """Refuse a first design that is no design of a cell's body.
+
+    Raises:
+        ValueError: with the design and what that body's designs are.
+    """
+    design, body = cell.settings.first_design, BODIES[cell.environment]
+    low, high = body.DESIGN_BOUNDS
+    if design and not (len(design) == body.DESIGN_SIZE and all(low <= factor <= high for factor in design)):
+        raise ValueError(
+            f"first_design is {design}, a design of {cell.environment} has {body.DESIGN_SIZE} scale factors from {low} "
+            f"to {high}; write such, and one for each environment in the overrides of a block of its own"
+        )
 
 
 def to_json(study: Study) -> str:
@@ -183,14 +211,28 @@ def from_json(path: Path) -> Study:
         return _parsed(Study, json.loads(path.read_text()))
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror})") from None
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise ValueError(f"{path} is no study: {error}") from None
 
 
-def _parsed(kind: type[Any], values: Mapping[str, Any]) -> Any:
-    fields = {field.name for field in dataclasses.fields(kind)}
+def _parsed(owner: type[Any], written: object) -> Any:
+    """A study or a block of one from what JSON has."""
+    values = dict(fitted("it", written, Mapping[str, Any]))
+    fields = {field.name: field for field in dataclasses.fields(owner)}
     if other := sorted(values.keys() - fields):
         raise ValueError(f"it has {', '.join(other)}; there are {', '.join(sorted(fields))}")
-    values = _typed(values)
-    blocks = {"blocks": tuple(_parsed(Block, block) for block in values["blocks"])} if "blocks" in values else {}
-    return kind(**values | blocks)
+    needed = {name for name, field in fields.items() if field.default is field.default_factory is dataclasses.MISSING}
+    if lacking := sorted(needed - values.keys()):
+        raise ValueError(f"it has no {', '.join(lacking)}; it needs {', '.join(sorted(needed))}")
+    if "blocks" in values:
+        blocks = fitted("blocks", values["blocks"], tuple[Mapping[str, Any], ...])
+        values["blocks"] = tuple(itertools.starmap(_block, enumerate(blocks, start=1)))
+    kinds = kinds_of(owner)
+    return owner(**{name: fitted(name, value, kinds[name]) for name, value in values.items()})
+
+
+def _block(number: int, written: object) -> Block:
+    try:
+        return _parsed(Block, written)
+    except ValueError as error:
+        raise ValueError(f"in block {number}: {error}") from None

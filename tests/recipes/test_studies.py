@@ -16,7 +16,7 @@ from recipes.experiment import build
 from recipes.settings import Settings, plain
 from recipes.studies.cell import compute, episodes_done, seconds_of, to_go_on, tries
 from recipes.studies.conduct import Resources, all_episodes, in_words, take_up
-from recipes.studies.definition import ARMS, PROTOCOLS, Block, Study, from_json, to_json
+from recipes.studies.definition import ARMS, PROTOCOLS, Block, Study, from_json
 from recipes.studies.ledger import Ledger, State, read_ledger
 from recipes.studies.named import STUDIES
 from recipes.study import entry
@@ -75,27 +75,23 @@ def test_seeds_can_share_a_cell_along_the_run_axis() -> None:
     assert [(cell.settings.seed, cell.settings.num_runs) for cell in cells] == [(0, 2), (2, 2), (4, 1)]
 
 
-def test_a_study_is_read_as_it_was_written(tmp_path: Path) -> None:
-    more = Block(environments=("half_cheetah",), arms=("noisy",), seeds=(0,), overrides={"num_cells": (4, 4)})
-    written = study(blocks=(more,), overrides={"lr": 0.1})
-    (tmp_path / "study.json").write_text(to_json(written))
-    read = from_json(tmp_path / "study.json")
-    assert read.cells() == written.cells()
-    assert read.cells()[2].settings.num_cells == (4, 4)
-    assert to_json(read) == to_json(written)
-
-
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
         ({"environments": ("ant",)}, "'ant' is none of the environments that there are: half_cheetah, hopper, walker"),
         ({"arms": ("oracel",)}, "'oracel' is none of the arms"),
         ({"tasks": ("up",)}, "'up' is none of the tasks"),
-        ({"protocol": "papre"}, "'papre' is none of paper, "),
+        ({"protocol": "papre"}, "protocol is 'papre', it must be one of paper, preview, smoke"),
         ({"overrides": {"learning_rate": 1}}, "overrides of learning_rate are not possible"),
         ({"overrides": {"seed": 1}}, "overrides of seed are not possible"),
-        ({"seeds": (1, 1)}, "hopper-forward-known-1, hopper-forward-none-1 would be made twice"),
-        ({"seeds_per_cell": 0}, "seeds_per_cell is 0"),
+        ({"overrides": {"num_cells": 4}}, "num_cells is 4, it must be a list of whole numbers"),
+        ({"overrides": {"lr": -1}}, "lr is -1.0, it must be above 0"),
+        ({"seeds": (1, 1)}, "seeds has 1 more than once; name each of them once"),
+        ({"seeds": (0, 1, 1, 2), "seeds_per_cell": 2}, "seeds has 1 more than once"),
+        ({"arms": ("none", "none")}, "arms has 'none' more than once"),
+        ({"seeds": ()}, "seeds is empty"),
+        ({"blocks": ({"arms": ("none",)},)}, "blocks is .*, it must be a list of Block"),
+        ({"seeds_per_cell": 0}, "seeds_per_cell is 0, it must be at least 1"),
     ],
 )
 def test_what_cannot_be_is_named_before_anything_is_computed(fields: dict, sentence: str) -> None:
@@ -103,16 +99,22 @@ def test_what_cannot_be_is_named_before_anything_is_computed(fields: dict, sente
         study(**fields)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [("[", "is no study"), ('{"seed": 1}', "it has seed; there are arms, blocks"), ('{"name": "a"}', "missing")],
-)
-def test_a_file_that_is_no_study_is_named(tmp_path: Path, text: str, sentence: str) -> None:
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=sentence):
-        from_json(tmp_path / "a.json")
-    with pytest.raises(ValueError, match=r"b.json cannot be read \(No such file"):
-        from_json(tmp_path / "b.json")
+@pytest.mark.parametrize(("seeds", "twice"), [((3,), "none-3"), ((4, 3), "none-3, hopper-forward-none-4")])
+def test_a_seed_that_two_blocks_share_is_named_with_its_place(seeds: tuple[int, ...], twice: str) -> None:
+    """Also where it is not the first of its cell, which alone names the cell's folder."""
+    more = Block(environments=("hopper",), arms=("none",), seeds=seeds)
+    with pytest.raises(ValueError, match=f"^hopper-forward-{twice} would be made twice; take it out of all but one b"):
+        study(blocks=(more,), seeds_per_cell=2)
+
+
+def test_a_first_design_is_held_against_each_body() -> None:
+    one = study(overrides={"first_design": (1, 1, 1, 2)})
+    assert one.cells()[0].settings.first_design == (1, 1, 1, 2)
+    assert all(isinstance(factor, float) for factor in one.cells()[0].settings.first_design)
+    with pytest.raises(ValueError, match=r"1.0, 2.5\), a design of hopper has 4 scale factors from 0.5 to 2.0; write"):
+        study(overrides={"first_design": (1, 1, 1, 2.5)})
+    with pytest.raises(ValueError, match="a design of walker has 7 scale factors"):
+        study(environments=("hopper", "walker"), overrides={"first_design": (1, 1, 1, 2)})
 
 
 def test_the_preview_has_the_papers_networks_batches_and_updates() -> None:
