@@ -31,6 +31,7 @@ class Measured:
         run: whose they are.
         area: under the best-return curve of Fig. 1, over the number of designs: the mean best return of a design.
         final: the highest best return of all designs: what is in hand when the budget is spent.
+        search_gain: mean best return of the designs that maximised Q minus that of the random ones, which take turns.
         correlation: Spearman's, of the prediction Q(xi) before a body was built and the best return on it, over the
             bodies that came after the first ones.
         correlation_given_order: the same with the order of building held fixed: Q and returns both rise while the
@@ -43,12 +44,13 @@ class Measured:
             ``metrics.csv``.
         updates: of all learners and the ensemble.
 
-    All but the last three are NaN while they are not known; area and final while the run is under way.
+    All but the last three are NaN while they are not known; area, final and search_gain while the run is under way.
     """
 
     run: Run
     area: float
     final: float
+    search_gain: float
     correlation: float
     correlation_given_order: float
     bias_optimised: float
@@ -72,6 +74,7 @@ def measure(run: Run, failure: float) -> Measured:
         run,
         area=float(values.mean()),
         final=float(values.max()),
+        search_gain=best_mean(run, "optimised") - best_mean(run, "random") if run.over else math.nan,
         correlation=spearman(chosen, "predicted", "best_return"),
         correlation_given_order=spearman_given(chosen, "predicted", "best_return", given="design"),
         bias_optimised=bias([row for row in chosen if row["kind"] == "optimised"]),
@@ -80,6 +83,12 @@ def measure(run: Run, failure: float) -> Measured:
         episode_seconds=float(np.median([row.get("seconds/episode", math.nan) for row in rows])),
         updates=len(rows) * an_episode,
     )
+
+
+def best_mean(run: Run, kind: str) -> float:
+    """Mean best return of a run's designs of one kind; NaN where there is none."""
+    values = [row["best_return"] for row in run.designs if row["kind"] == kind]
+    return float(np.mean(values)) if values else math.nan
 
 
 def spearman(rows: Sequence[Row], one: str, other: str) -> float:

@@ -25,8 +25,9 @@ STATISTICS: dict[str, Statistic] = {"mean": mean, "IQM": iqm}
 PANEL = (3.6, 2.3)  # inches
 CAPTION = (
     "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
-    "over the evaluation episodes on it. Faint: single runs. Strong: mean and interquartile mean (IQM) of those "
-    "that have reached the design. "
+    "over the evaluation episodes on it. After the first designs, which are given, those that maximise Q and random "
+    "ones take turns. Faint: single runs. Strong: mean and interquartile mean (IQM) of those that have reached the "
+    "design. "
     f"Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
     "environment, task and arm). "
 )

@@ -20,7 +20,7 @@ from recipes.reporting.palette import BLACK, GREY, put_legend
 
 LABELS = {"area": "area: mean best return of a design (1)", "final": "final: highest best return (1)"}
 ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not"
-PREDICTING = ("rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
+OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
 INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
 
 
@@ -52,7 +52,9 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
     caption = (
         "Runs that have tried all their designs, or diverged: points. Bars: interquartile means (IQM) and their "
         f"intervals; ticks: means. {INTERVALS}area: the mean over designs of a design's best return; final: the "
-        "highest of all designs. rank_correlation: Spearman's, of Q(xi) before a body was built and the best return on "
+        "highest of all designs. search_gain: mean best return of the designs that maximised Q minus that of the "
+        "random ones, which take turns with them, mean over runs. rank_correlation: Spearman's, of Q(xi) before a body "
+        "was built and the best return on "
         "it, over the bodies after the first ones, mean over runs; _given_order: the partial one with the order of "
         "building held fixed, as Q and returns both rise while the networks learn. bias: (1 - gamma) Q(xi) - best "
         "return / steps, both a reward per step, equal if the reward is constant, of bodies that maximised Q and of "
@@ -73,7 +75,7 @@ def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cell
         values = np.array([getattr(m, name) for m in over])
         row |= {f"{name}_mean": float(mean(values)) if over else np.nan}
         row |= {f"{name}_iqm": float(iqm(values)) if over else np.nan} | limits(f"{name}_iqm", iqm, values)
-    for name in PREDICTING:
+    for name in OF_SEARCH:
         values = np.array([getattr(m, name.removeprefix("rank_")) for m in over])
         values = values[np.isfinite(values)]
         row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
@@ -174,6 +176,7 @@ def predicted(runs: Runs) -> Plot:
 OF_RUN = (
     "area",
     "final",
+    "search_gain",
     "correlation",
     "correlation_given_order",
     "bias_optimised",

@@ -23,7 +23,7 @@ import torch
 from coim import HopperMorph
 from recipes.experiment import run as run_recipe
 from recipes.soak import differences
-from recipes.studies.conduct import Conductor, Resources, lacking
+from recipes.studies.conduct import Conductor, Resources, lacking, without_words_of_ray
 from recipes.studies.definition import Block, Study, to_json
 from recipes.studies.ledger import Ledger, read_ledger
 from recipes.study import entry
@@ -42,7 +42,8 @@ def conduct(folder: Path, what: Study) -> tuple[list[str], Ledger]:
     folder.mkdir(exist_ok=True)
     cells = what.cells()
     ledger = Ledger(folder / "ledger.csv", cells)
-    return Conductor(folder, cells, ledger, Resources(), sys.stdout).conduct(), ledger
+    with without_words_of_ray(folder) as terminal:
+        return Conductor(folder, cells, ledger, Resources(), terminal).conduct(), ledger
 
 
 def meanwhile(folder: Path, cell: str, *, rows: int, act: Callable[[int], None]) -> threading.Thread:

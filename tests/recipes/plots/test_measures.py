@@ -21,6 +21,7 @@ def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> 
     (run,) = read_runs(tmp_path).found
     found = measure(run, failure=-100)
     assert (run.state, found.area, found.final) == ("finished", 25, 40)
+    assert found.search_gain == 20 - 30  # design 3 was searched for, design 4 drawn
     # (1 - .9) Q against best return / 10 steps, of design 3, which was searched for, and 4, which was drawn
     assert found.bias_optimised == pytest.approx(0.2 - 2)
     assert found.bias_random == pytest.approx(0.3 - 3)
@@ -104,6 +105,7 @@ def test_a_run_under_way_has_no_area_yet_and_its_last_design_no_best_return(tmp_
     assert [row["design"] for row in run.designs] == [1, 2]
     assert run.state == "under way"
     assert math.isnan(measure(run, failure=0).area)
+    assert math.isnan(measure(run, failure=0).search_gain)
     assert np.isnan(run.best_returns(0)).tolist() == [False, False, True, True]
 
 
