@@ -17,6 +17,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import itertools
 import math
 import signal
 import sys
@@ -169,6 +170,10 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
         lines += best_designs(runs, place, [arm for arm in asked.arms if arm not in there], rule)
     if not lines:
         raise ValueError(f"no run of {', '.join(asked.arms)} has an optimised design yet; let the study go on")
+    there = {(line["environment"], line["task"], line["arm"]) for line in lines}
+    for place, arm in itertools.product(runs.places, asked.arms):
+        if arm in runs.arms_at(place) and (*place, arm) not in there:
+            print(f"{', '.join(place)}: no run of {arm} has an optimised design, there is nothing to retrain of it")
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for line in lines for key in line)), lineterminator="\n")
     writer.writeheader()

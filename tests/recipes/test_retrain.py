@@ -187,7 +187,12 @@ def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_an_arm_that_chose_no_body_has_nothing_to_retrain(tmp_path: Path) -> None:
+def test_an_arm_that_chose_no_body_has_nothing_to_retrain(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     write_cell(tmp_path, "hopper-forward-none-0", [90, 20])
     with pytest.raises(SystemExit, match="no run of none has an optimised design yet"):
         main([str(tmp_path), "--arms", "none"])
+    found(tmp_path, "hopper-forward-known-0", (31, 27, 33))
+    choose(read_runs(tmp_path), tmp_path / "chosen.csv", Retrain(study=tmp_path))
+    assert capsys.readouterr().out == (
+        "hopper, forward: no run of none has an optimised design, there is nothing to retrain of it\n"
+    )
