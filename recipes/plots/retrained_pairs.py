@@ -3,7 +3,7 @@
 The paper's test takes every design for a sample of its own. Those of one run are not: they share the weights, the data
 and the luck that chose them. In 2000 simulated studies without any difference between arms, of five runs with five
 designs each, with deviations of 1 between runs, 0.5 between the designs of a run and 0.5 between two trainings on a
-design, this is found at a level of 5 %:
+design, this is found at a level of 5 % (the tests of this module repeat the first two rows):
 
 ==========================================  =====================  =========================  ===========
 rejected by                                 best half of each run  best half of all together  all designs

@@ -12,6 +12,7 @@ from scipy import stats
 
 from recipes.figures import write_figures
 from recipes.plots import retrained, retrained_pairs
+from recipes.plots.measures import welch
 from recipes.plots.plot import Plot
 from recipes.plots.retrained_pairs import interval_over_runs, pairs
 from tests.recipes.made_up_study import read_table, write_cell, write_ledger, write_table
@@ -223,3 +224,31 @@ def test_designs_that_were_chosen_before_the_study_grew_say_so(tmp_path: Path) -
         "Chosen before all runs were over (hopper, forward, known: 2 of 5 planned now); designs of the others had no "
         "chance. " in drawn(tmp_path)[0].caption
     )
+
+
+@pytest.mark.parametrize(
+    ("chosen", "over_designs", "over_runs"),
+    [("each run", 0.23, 0.05), ("all together", 0.38, 0.14), ("all", 0.34, 0.05)],
+)
+def test_the_tests_find_differences_that_are_not_there_as_often_as_is_said(
+    chosen: str, over_designs: float, over_runs: float
+) -> None:
+    rng, studies = np.random.default_rng(0), 1000
+
+    def arm() -> list[np.ndarray]:
+        """Five runs with five designs of one distribution; those of each run that are retrained."""
+        bodies = rng.normal(size=(5, 1)) + 0.5 * rng.normal(size=(5, 5))
+        found, new = bodies + 0.5 * rng.normal(size=(5, 5)), bodies + 0.5 * rng.normal(size=(5, 5))
+        kept = np.ones((5, 5), bool)
+        if chosen == "each run":
+            kept = found >= np.sort(found, axis=1)[:, 2:3]  # the best three
+        elif chosen == "all together":
+            kept = found >= np.sort(found, axis=None)[12]  # the best thirteen
+        return [of_run[those] for of_run, those in zip(new, kept) if those.any()]
+
+    rejected = np.zeros(2)
+    for _ in range(studies):
+        x, y = arm(), arm()
+        rejected[0] += welch(np.concatenate(x), np.concatenate(y)) < 0.05
+        rejected[1] += welch(np.array([r.mean() for r in x]), np.array([r.mean() for r in y])) < 0.05
+    assert rejected / studies == pytest.approx([over_designs, over_runs], abs=0.04)  # 2.5 standard errors
