@@ -11,8 +11,8 @@ from benchmarks.measure import Figure, Target, interleaved, over
 from benchmarks.parts import update_products
 from benchmarks.updates import too_few_cores
 from coim import EpisodeDone, HalfCheetahMorph
-from recipes.experiment import build
 from recipes.machine import available_cores
+from recipes.parts import build
 from recipes.settings import Settings
 
 

@@ -14,8 +14,8 @@ import tyro
 from benchmarks.networks import FOLDER, TRAINED, save
 from coim import EpisodeDone
 from coim.envs import BODIES
-from recipes.experiment import build
 from recipes.machine import available_cores, checked_device, prepare
+from recipes.parts import build
 from recipes.settings import Settings
 
 

@@ -19,8 +19,8 @@ import torch
 import tyro
 
 from coim import EpisodeDone, HalfCheetahMorph, run_episode
-from recipes.experiment import build
 from recipes.machine import available_cores, checked_device, prepare
+from recipes.parts import build
 from recipes.reporting.pictures import save
 from recipes.settings import Settings
 

@@ -17,9 +17,10 @@ import torch
 
 from coim import MorphEnv, select_run
 from coim.envs import BODIES
-from recipes.experiment import build, train
+from recipes.experiment import train
 from recipes.interrupt import on_command_line
 from recipes.machine import checked_device
+from recipes.parts import build
 from recipes.probing.design_space import FILE, SIDE, design_space, principal_directions, with_area
 from recipes.probing.errors import change_variance
 from recipes.probing.probed import ProbedCoAdaptation, other_learner

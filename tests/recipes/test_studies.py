@@ -12,7 +12,7 @@ from interrupted_runs import TINY, cut, resume
 
 from coim import EpisodeDone
 from coim.envs import BODIES
-from recipes.experiment import build
+from recipes.parts import build
 from recipes.settings import Settings, plain
 from recipes.studies.cell import compute, episodes_done, seconds_of, to_go_on, tries
 from recipes.studies.conduct import Resources, all_episodes, in_words, take_up
