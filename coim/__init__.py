@@ -7,7 +7,7 @@ Everything that is public, in one flat list. Importing it starts nothing, reads 
 from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
 
 # isort: split
-from coim.batches import sample_batches, sample_mixed, sample_mixture
+from coim.batches import batch_parts, sample_batches, sample_mixture
 from coim.buffers import Buffers, TransitionBuffer, transition_rows
 from coim.coadaptation import CoAdaptation
 from coim.designs import (
@@ -64,13 +64,13 @@ __all__ = [
     "TriedDesign",
     "WalkerMorph",
     "WorldModelEnv",
+    "batch_parts",
     "imagine",
     "load_run",
     "make_policy",
     "make_qvalue",
     "run_episode",
     "sample_batches",
-    "sample_mixed",
     "sample_mixture",
     "select_run",
     "transition_rows",

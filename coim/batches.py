@@ -58,6 +58,8 @@ def sample_mixture(
 ) -> TensorDict:
     """Draw batches that are put together from several buffers, each with its exact number of rows.
 
+    (TorchRL's ``ReplayBufferEnsemble`` draws the buffers at random, so that its shares hold on average only.)
+
     Args:
         sources: buffers and the rows that each gives to a batch, in the order in which they appear there. A buffer that
             gives 0 rows may be empty.
@@ -93,37 +95,6 @@ def sample_mixture(
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
-def sample_mixed(
-    real: TensorDictReplayBuffer,
-    imagined: TensorDictReplayBuffer,
-    *,
-    batch_size: int = 256,
-    share: float = 0.2,
-    num_batches: int = 1,
-) -> TensorDict:
-    """Draw the population's batches: 80 % real, 20 % imagined, exactly (Sec. 5).
-
-    With the defaults each batch is 205 real rows and then 51 imagined ones. (TorchRL's ``ReplayBufferEnsemble`` draws
-    the buffers at random, so that its shares hold on average only.)
-
-    Args:
-        real: Replay_Pop.
-        imagined: Replay_Art.
-        batch_size: B, rows per batch.
-        share: of imagined rows, in [0, 1]; they are the last ``round(share * B)``.
-        num_batches: batches drawn at once.
-
-    Returns:
-        ``[num_batches, B, K]`` rows with ``imagined`` ``[num_batches, B, K, 1]`` written.
-
-    Raises:
-        ValueError: if a buffer that is drawn from is empty, the share leaves [0, 1], or the batch is too small to hold
-            a row of each.
-    """
-    parts = batch_parts(batch_size, imagined=share)
-    return sample_mixture([(real, parts.own), (imagined, parts.imagined)], num_batches, imagined=imagined)
-
-
 @dataclass(frozen=True)
 class BatchParts:
     """Rows of one batch by where they come from."""
@@ -134,7 +105,7 @@ class BatchParts:
 
 
 def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -> BatchParts:
-    """Whole rows for shares of a batch.
+    """Whole rows for shares of a batch, as `sample_mixture` takes them.
 
     Args:
         batch_size: rows in all.
@@ -145,7 +116,7 @@ def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -
         ValueError: if a share leaves [0, 1], the shares need more rows than there are, or one is too small for a row.
 
     Example:
-        >>> batch_parts(256, imagined=0.2)
+        >>> batch_parts(256, imagined=0.2)  # the population's, 80 % real and 20 % imagined (Sec. 5)
         BatchParts(own=205, other=0, imagined=51)
     """
     for name, share in (("imagined", imagined), ("other", other)):

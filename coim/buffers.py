@@ -115,7 +115,12 @@ class TransitionBuffer(TensorDictReplayBuffer):
         return {"rows": rows, "writer": self.writer.state_dict(), "generator": self._rng.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the place of the buffer that :meth:`state_dict` was read from; this one may be larger."""
+        """Take the place of the buffer that :meth:`state_dict` was read from; this one may be larger.
+
+        Raises:
+            ValueError: if that one held more rows than fit here, or of another number of runs; nothing is changed then.
+        """
+        self.check_state(state_dict)
         self.empty()
         rows, writer = state_dict["rows"], dict(state_dict["writer"])
         if rows:
@@ -129,6 +134,15 @@ class TransitionBuffer(TensorDictReplayBuffer):
         writer["_cursor"] %= self.capacity
         self.writer.load_state_dict(writer)
         self._rng.set_state(state_dict["generator"].clone())  # torch reads a view of a larger tensor wrongly
+
+    def check_state(self, state_dict: Mapping[str, Any]) -> None:
+        """Refuse a state that does not fit; see :meth:`load_state_dict`."""
+        for values in state_dict["rows"].values():
+            if len(values) > self.capacity or values.shape[1] != self.num_runs:
+                raise ValueError(
+                    f"the state holds {len(values)} rows of {values.shape[1]} run(s), this buffer has room for "
+                    f"{self.capacity} of {self.num_runs}; make it as large, and with as many runs, as the one saved"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +206,16 @@ class Buffers:
         return {field.name: getattr(self, field.name).state_dict() for field in fields(self)}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Fill the buffers as those that :meth:`state_dict` was read from."""
+        """Fill the buffers as those that :meth:`state_dict` was read from.
+
+        Raises:
+            ValueError: if one of them does not fit; nothing is changed then.
+        """
+        self.check_state(state_dict)
         for field in fields(self):
             getattr(self, field.name).load_state_dict(state_dict[field.name])
+
+    def check_state(self, state_dict: Mapping[str, Any]) -> None:
+        """Refuse a state of which a buffer does not fit."""
+        for field in fields(self):
+            getattr(self, field.name).check_state(state_dict[field.name])

@@ -81,7 +81,6 @@ class CoAdaptation:
         individual_imagined_share: share of an individual batch drawn from Replay_Art. Algorithm 1 cites Eq. 7-8 for the
             individual networks too, Sec. 5 gives imagined rows to the population alone; 0 follows Sec. 5.
         num_start_states: n, start states that Eq. 5 averages over.
-        imagined_rows: rows in Replay_Art after a refresh; None takes one for each imagined row of the coming updates.
         side_by_side: train the individual learner in one thread while another trains the population's and the ensemble.
             They do not depend on each other, and the result is the same to the last bit.
         precision: of the networks' products in Eq. 5; each learner has its own.
@@ -89,7 +88,7 @@ class CoAdaptation:
 
     Raises:
         ValueError: if a count is below its least value, a share outside [0, 1] or of less than a row, first designs
-            have the wrong shape, or only one of ``dream`` and ``generator`` is given.
+            have the wrong shape, ``bodies`` is unknown, or only one of ``dream`` and ``generator`` is given.
 
     Note:
         Whoever stops at an event may come back to it: iterating again goes on with what comes next, and so does another
@@ -124,13 +123,14 @@ class CoAdaptation:
         individual_mix: float = 0.0,
         individual_imagined_share: float = 0.0,
         num_start_states: int = 36,
-        imagined_rows: int | None = None,
         side_by_side: bool = False,
         precision: Literal["float32", "bfloat16"] = "float32",
         seed: int = 0,
     ) -> None:
         if (dream is None) != (generator is None):
             raise ValueError("imagining needs both a dream and a generator; give both, or neither for the baseline")
+        if bodies not in ("search", "random", "fixed"):
+            raise ValueError(f"bodies={bodies!r} is unknown; choose 'search', 'random' or 'fixed'")
         counts = {
             "num_designs": num_designs,
             "first_episodes": first_episodes,
@@ -167,7 +167,7 @@ class CoAdaptation:
             batch_size, imagined=individual_imagined_share * imagines, other=individual_mix
         )
         self.batch_size, self.num_start_states = batch_size, num_start_states
-        self.imagined_rows = imagined_rows if imagined_rows is not None else self._rows_to_draw()
+        self.imagined_rows = self._rows_to_draw()
         self.index, self.env_steps = 0, 0
         self.trial: Trial | None = None  # the body that is being tried
         seeds = torch.Generator().manual_seed(seed)

@@ -93,6 +93,7 @@ def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
     for part in ("dynamics", "dream"):
         if (state[part] is None) != (getattr(algorithm, part) is None):
             raise ValueError(f"one of the state and the algorithm has a {part} and the other has none; make it alike")
+    algorithm.buffers.check_state(state["buffers"])
     algorithm.population.load_state_dict(state["population"])
     algorithm.individual.load_state_dict(state["individual"])
     if algorithm.dynamics is not None:
@@ -115,7 +116,8 @@ def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
 
 def _trial(saved: Mapping[str, Any], algorithm: CoAdaptation) -> Trial:
     """A trial of its own, the design on the bodies' device."""
-    return Trial(**{**saved, "design": saved["design"].to(algorithm.env.device), "best": saved["best"].clone()})
+    own: dict[str, Any] = {name: value.clone() if isinstance(value, Tensor) else value for name, value in saved.items()}
+    return Trial(**{**own, "design": own["design"].to(algorithm.env.device)})
 
 
 def _if_any(owner: object, method: str, *args: Any) -> Any:

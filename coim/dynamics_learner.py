@@ -85,7 +85,15 @@ class DynamicsLearner:
         self._step = CudaGraphModule(self._update_once) if on_gpu else self._update_once
 
     def observe(self, rows: TensorDictBase) -> None:
-        """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets."""
+        """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets.
+
+        Args:
+            rows: ``[*B, (K)]``, each row once in its life.
+
+        Raises:
+            ValueError: if there are no rows or the run axis is missing.
+        """
+        check_batch(rows.batch_size, self.num_runs)
         self.ensemble.update_statistics(rows)
 
     def state_dict(self) -> dict[str, Any]:

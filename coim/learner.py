@@ -29,6 +29,7 @@ from coim.models.scaling import InputScaling
 from coim.models.stacked import StackedMLP
 from coim.objectives.functional import mixing_weights
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
+from coim.objectives.runs import check_batch
 from coim.objectives.sac import CoImSACLoss
 
 Precision = Literal["float32", "bfloat16"]
@@ -63,7 +64,8 @@ class SACLearner:
         On CUDA an update is captured once as a CUDA graph and replayed: all batches must have one size there, and
         wherever the gradients are compiled.
 
-        Moving the modules to another device or dtype afterwards would part them from the flat buffers.
+        Moving the modules to another device or dtype afterwards, or giving them to another learner, parts them from the
+        flat buffers; `update` refuses that.
 
     Example:
         >>> import torch
@@ -160,7 +162,15 @@ class SACLearner:
 
         Returns:
             ``loss_actor``, ``loss_qvalue`` and ``entropy`` of each run, ``[K]``: means over the U updates.
+
+        Raises:
+            ValueError: if there are no rows or the run axis is missing.
+            RuntimeError: if the networks' weights no longer lie in the flat buffer.
         """
+        check_batch(batches.batch_size, self.num_runs)
+        lies_at = {parameter.data_ptr() for parameter in self._parameters()}
+        if lies_at != {view.data_ptr() for view in views(self._weights, self._parameters())}:
+            raise RuntimeError("the networks were moved after their learner was made; make the learner last")
         rows = self._arrange(batches)
         means = torch.stack([self._step(*(x[u] for x in rows)) for u in range(len(batches))]).mean(0)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
@@ -170,11 +180,10 @@ class SACLearner:
         if self._read_weights.dtype != self._weights.dtype:
             self._read_weights.copy_(self._weights)
             self._read_targets.copy_(self._targets)
-        one_by_one = len(self._networks) > 1 or self.num_runs is None
         found = [
             self._find(
                 *networks,
-                Batch(*(x[run] for x in rows)) if one_by_one else Batch(*rows),
+                Batch(*(x[run] for x in rows)) if self._one_by_one else Batch(*rows),
                 alpha=self.loss.alpha,
                 gamma=self.loss.gamma,
                 log_scale_range=LOG_SCALE_RANGE,
@@ -211,6 +220,7 @@ class SACLearner:
         gradients = views(self._weights.grad, own)
         policy_gradients, critic_gradients = gradients[: -len(targets)], gradients[-len(targets) :]
         stack_runs = self._weights.device.type != "cpu" if stack_runs is None else stack_runs
+        self._one_by_one = self.num_runs is None or not stack_runs
         runs: list[Any] = [()]  # where a network of one run, or of all of them, lies in stacked weights
         if self.num_runs is not None:
             runs = [(slice(None),)] if stack_runs else [(run,) for run in range(self.num_runs)]

@@ -49,7 +49,7 @@ class TriedDesign:
     Attributes:
         run: in ``0 .. K - 1``.
         number: 1 for the first, as in the files.
-        kind: one of the first designs, the optimum of Eq. 5, or a random one.
+        kind: one of the first designs, the optimum of Eq. 5, a random one, or the one body of a run with a fixed body.
         design: ``[D]``.
         predicted: Eq. 5 before the body was built; NaN where there was no start state yet.
         best_return: highest evaluation return.
@@ -76,7 +76,7 @@ class SavedRun:
         settings: every setting, as ``config.json`` has it.
         bodies: K of them, with the run's task and length of an episode, ready to be reset with designs.
         population: pi_Pop and Q_Pop, which serve every design.
-        individual: pi_Ind and Q_Ind of the design that the run came to last, as they were at its checkpoint; see
+        individual: pi_Ind and Q_Ind of the last design that an episode was over of, as they were at the checkpoint; see
             `policy_of` for the others.
         ensemble: p~; None in a run without one.
         designs: those whose episodes are all over, a row per run and design.
@@ -113,7 +113,7 @@ class SavedRun:
         """Let the next reset of the bodies be the one before the best evaluation of a design.
 
         Returns:
-            The design to reset them with, ``[K, D]``, to the last bit; `designs` has the seven digits of a CSV file.
+            The design to reset them with, ``[K, D]``.
         """
         best = self._best(number)
         state = self.bodies.get_simulation_state()

@@ -127,13 +127,16 @@ def remove_run(folder: Path) -> None:
 
 
 def only(kept: set[str], ledger: Path) -> str:
-    """A ledger in which every run waits that was not kept."""
-    waiting = {"state": "waiting", "tries": 0, "seconds": None}
-    return in_csv(
-        # Why a cell failed once is told with paths of its machine.
-        dataclasses.replace(row, message="", **{"state": "finished"} if row.cell in kept else waiting)
-        for row in read_ledger(ledger)
-    )
+    """A ledger in which every run waits that was not kept and has not failed again and again."""
+    rows = []
+    for row in read_ledger(ledger):
+        row.message = ""  # why a cell failed is told with paths of its machine
+        if row.cell in kept:
+            row.state = "finished"
+        elif row.state != "failed":
+            row.state, row.tries, row.seconds = "waiting", 0, None
+        rows.append(row)
+    return in_csv(rows)
 
 
 if __name__ == "__main__":

@@ -8,19 +8,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from coim import CoAdaptation, DesignChosen, EpisodeDone, MorphEnv
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints, refuse_lost_checkpoints
 from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, prepare
-from recipes.parts import build
+from recipes.parts import build, episodes_of_designs
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
 from recipes.results import Results, default_folder, refuse_filled, versions
-from recipes.settings import Settings, episodes_of, parse, read_config
+from recipes.settings import Settings, parse, read_config
 from recipes.wandb_log import WandbLog
 
 
@@ -112,11 +110,11 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
     results = Results(folder, name, settings, algorithm.env.design_spec.shape[0], notes=notes)
     progress = Progress(
         num_designs=settings.num_designs,
-        total_episodes=sum(episodes_of(settings, index) for index in range(settings.num_designs)),
+        total_episodes=sum(episodes_of_designs(type(algorithm.env), settings)),
         updates=algorithm.updates_per_episode,
         imagined_share=algorithm.population_parts.imagined / settings.batch_size,
         done=algorithm.env_steps // settings.episode_steps,
-        best=float("-inf") if trial is None else float(trial.best[trial.best.isfinite()].mean().nan_to_num(-torch.inf)),
+        best=None if trial is None else trial.best,
         quiet=settings.quiet,
     )
     log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb, quiet=settings.quiet)

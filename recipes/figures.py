@@ -1,5 +1,7 @@
 """The figures and the statistics of a study: ``python -m recipes.figures STUDY_FOLDER``.
 
+A folder in which there is only a measured run, ``model_error/``, has Fig. 4 alone.
+
 Everything is read from the study's folder, at any state of it, and written to its ``figures/``: each figure as PNG and
 PDF, the numbers that it shows as CSV, short tables as Markdown too, and ``README.md`` with all of them and captions.
 """
@@ -9,7 +11,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
+import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -18,11 +22,15 @@ import tyro
 
 from recipes.plots import cartpole, design_space, model_error, retrained, returns, statistics
 from recipes.plots.intervals import FEW
+from recipes.plots.measured import FOLDER
 from recipes.plots.plot import Plot
 from recipes.reporting.page import FONT
 from recipes.reporting.records import number
+from recipes.settings import read_config
 
 MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
+OF_MODELS = (model_error, design_space, cartpole)  # what a folder without cells has, Fig. 4
+SUFFIXES = ("png", "pdf", "csv", "md")
 RESOLUTION = 150  # dots per inch of a PNG
 
 
@@ -55,24 +63,38 @@ def write_figures(study: Path) -> list[Plot]:
         The plots, also those that have no figure because their input is not there.
 
     Raises:
-        ValueError: if the folder is no study's.
+        ValueError: if the folder is no study's, nor has a measured run.
     """
     folder, found = study / "figures", []
+    measured_only = (study / FOLDER).is_dir() and not (study / "cells").is_dir()
     with mpl.rc_context(FONT):
-        for module in MODULES:
+        for module in OF_MODELS if measured_only else MODULES:
             for plot in module.plots(study):
                 folder.mkdir(exist_ok=True)
                 write_plot(folder, plot)
                 found.append(plot)
+    for name in drawn_before(folder) - {plot.name for plot in found}:
+        remove(folder, name)
     (folder / "README.md").write_text(page(study, found), encoding="utf-8")
     return found
 
 
+def drawn_before(folder: Path) -> set[str]:
+    """Names of the plots of an earlier drawing, which may have been called otherwise: by its page."""
+    page = folder / "README.md"
+    return set(re.findall(r"^## (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)) if page.is_file() else set()
+
+
+def remove(folder: Path, name: str) -> None:
+    """Take away the files of one plot."""
+    for suffix in SUFFIXES:
+        (folder / f"{name}.{suffix}").unlink(missing_ok=True)
+
+
 def write_plot(folder: Path, plot: Plot) -> None:
     """The files of one plot; those of an earlier drawing that has nothing to show any more are removed."""
-    files = {suffix: folder / f"{plot.name}.{suffix}" for suffix in ("png", "pdf", "csv", "md")}
-    for path in files.values():
-        path.unlink(missing_ok=True)
+    files = {suffix: folder / f"{plot.name}.{suffix}" for suffix in SUFFIXES}
+    remove(folder, plot.name)
     if plot.figure is None:
         return
     plot.figure.savefig(files["png"], dpi=RESOLUTION)
@@ -88,6 +110,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
 def page(study: Path, plots: Iterable[Plot]) -> str:
     """All figures with their captions, in Markdown."""
     lines = [f"# Figures of {study.resolve().name}", "", f"Written by `python -m recipes.figures`. {FEW}", ""]
+    lines += [made_by(study), ""] if (study / "cells").is_dir() else []
     for plot in plots:
         lines += [f"## {plot.name}", ""]
         if plot.figure is not None:
@@ -97,6 +120,27 @@ def page(study: Path, plots: Iterable[Plot]) -> str:
         else:
             lines += [f"Not drawn. {plot.caption}", ""]
     return "\n".join(lines)
+
+
+def made_by(study: Path) -> str:
+    """The code that made the runs; runs of several revisions may be runs of several algorithms.
+
+    Example:
+        >>> made_by(Path("docs/results/preview"))  # doctest: +SKIP
+        'All runs were made at revision 9d69483.'
+    """
+    revisions = Counter(" and ".join(sorted(revisions_of(path.parent))) for path in study.glob("cells/*/config.json"))
+    if len(revisions) < 2:
+        return f"All runs were made at revision {next(iter(revisions), 'unknown')}."
+    told = ", ".join(f"{count} at {revision}" for revision, count in sorted(revisions.items()))
+    return f"**Runs of different revisions are compared: {told}.** `CHANGELOG.md` says what moved results between them."
+
+
+def revisions_of(folder: Path) -> set[str]:
+    """Of the code that began a run and of those that went on with it, where they have noted it."""
+    config = read_config(folder)
+    noted = [config.get("revision"), *(entry.get("revision", "") for entry in config.get("resumed", []))]
+    return {"unknown" if revision is None else revision[:12] for revision in noted if revision != ""}
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> str:

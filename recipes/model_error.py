@@ -21,6 +21,7 @@ from recipes.experiment import train
 from recipes.interrupt import on_command_line
 from recipes.machine import checked_device
 from recipes.parts import build
+from recipes.plots.measured import FOLDER
 from recipes.probing.design_space import FILE, SIDE, design_space, principal_directions, with_area
 from recipes.probing.errors import change_variance
 from recipes.probing.probed import ProbedCoAdaptation, other_learner
@@ -85,9 +86,23 @@ def run(body: type[MorphEnv], name: str, settings: Settings, *, every: int, rows
     def finish(probed: ProbedCoAdaptation, folder: Path) -> None:
         note = write_design_space(probed, body, folder)
         if not settings.quiet:
-            print(f"{note}\nto draw it: python -m recipes.figures {folder.parent}")
+            print(f"{note}\nto draw it: {to_draw(folder)}")
 
     return train(body, name, settings, make, again="the same line with --out", finish=finish)
+
+
+def to_draw(folder: Path) -> str:
+    """What draws a measured run; figures look for it below a folder of its study.
+
+    Example:
+        >>> to_draw(Path("runs/study-preview/model_error"))
+        'python -m recipes.figures runs/study-preview'
+        >>> to_draw(Path("runs/hopper-20260101-120000-model_error"))
+        'move it into STUDY_FOLDER/model_error, then python -m recipes.figures STUDY_FOLDER'
+    """
+    above = [path.parent for path in (folder, *folder.parents) if path.name == FOLDER]
+    command = "python -m recipes.figures"
+    return f"{command} {above[0]}" if above else f"move it into STUDY_FOLDER/{FOLDER}, then {command} STUDY_FOLDER"
 
 
 def probe(

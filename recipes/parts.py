@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from coim import (
 from coim.batches import batch_parts
 from coim.designs import DesignGenerator, DesignSearch
 from recipes.machine import checked_device
-from recipes.settings import Settings, episodes_of
+from recipes.settings import Settings
 
 SIMULATED_ROWS = 250  # bodies that the simulator sets up and steps at once where it takes the ensemble's place
 
@@ -52,40 +53,11 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
 
     env, evaluation_env = bodies(), bodies()
     sizes = NetworkSizes.among(vars(settings))
-
-    def learner() -> SACLearner:
-        return SACLearner(
-            sizes.policy(env).to(device),
-            sizes.qvalue(env).to(device),
-            alpha=settings.alpha,
-            gamma=settings.gamma,
-            tau=settings.tau,
-            lr=settings.lr,
-            mix=settings.mix,
-            num_runs=sizes.stacked,
-            precision=settings.precision,
-            compile=settings.compile,
-            seed=next(seeds),
-        )
-
-    population, individual = learner(), learner()
+    population, individual = (make_learner(env, sizes, settings, seed=next(seeds)) for _ in range(2))
     generator = make_generator(env, settings)
     dynamics, dream = None, None
-    if generator is not None and settings.dream == "simulator":
-        # Its reset noise is never used: the seeds of all other parts stay what they are with an ensemble.
-        truth = SimulatorDynamics(body(num_runs=SIMULATED_ROWS, seed=0, num_threads=threads, device=device))
-        dream = WorldModelEnv(truth, env, batch_size=env.batch_size)
-    elif generator is not None:
-        ensemble = sizes.ensemble(env).to(device)
-        dynamics = DynamicsLearner(
-            ensemble,
-            lr=settings.model_lr,
-            weight_decay=settings.weight_decay,
-            num_runs=sizes.stacked,
-            precision=settings.precision,
-            compile=settings.compile,
-        )
-        dream = WorldModelEnv(ensemble, env, batch_size=env.batch_size)
+    if generator is not None:
+        dynamics, dream = make_dream(env, sizes, settings, threads=threads)
     return CoAdaptation(
         env,
         evaluation_env,
@@ -93,9 +65,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         individual=individual,
         buffers=make_buffers(env, settings, seed=next(seeds)),
         search=make_search(env, settings, seed=next(seeds)),
-        first_designs=torch.tensor(
-            [settings.first_design] if settings.first_design else body.FIRST_DESIGNS, device=device
-        ),
+        first_designs=torch.tensor(first_designs(body, settings), device=device),
         bodies=settings.bodies,
         dynamics=dynamics,
         dream=dream,
@@ -115,6 +85,54 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         precision=settings.precision,
         seed=next(seeds),
     )
+
+
+def make_learner(env: MorphEnv, sizes: NetworkSizes, settings: Settings, *, seed: int) -> SACLearner:
+    """Policy and critics with their optimiser."""
+    return SACLearner(
+        sizes.policy(env).to(env.device),
+        sizes.qvalue(env).to(env.device),
+        alpha=settings.alpha,
+        gamma=settings.gamma,
+        tau=settings.tau,
+        lr=settings.lr,
+        mix=settings.mix,
+        num_runs=sizes.stacked,
+        precision=settings.precision,
+        compile=settings.compile,
+        seed=seed,
+    )
+
+
+def make_dream(
+    env: MorphEnv, sizes: NetworkSizes, settings: Settings, *, threads: int
+) -> tuple[DynamicsLearner | None, WorldModelEnv]:
+    """Where transitions are imagined, and the learner of p~ unless the simulator itself imagines."""
+    if settings.dream == "simulator":
+        # Its reset noise is never used: the seeds of all other parts stay what they are with an ensemble.
+        truth = SimulatorDynamics(type(env)(num_runs=SIMULATED_ROWS, seed=0, num_threads=threads, device=env.device))
+        return None, WorldModelEnv(truth, env, batch_size=env.batch_size)
+    ensemble = sizes.ensemble(env).to(env.device)
+    learner = DynamicsLearner(
+        ensemble,
+        lr=settings.model_lr,
+        weight_decay=settings.weight_decay,
+        num_runs=sizes.stacked,
+        precision=settings.precision,
+        compile=settings.compile,
+    )
+    return learner, WorldModelEnv(ensemble, env, batch_size=env.batch_size)
+
+
+def first_designs(body: type[MorphEnv], settings: Settings) -> Sequence[Sequence[float]]:
+    """Bodies that every run tries first: those of the environment, or the one that is asked for."""
+    return [settings.first_design] if settings.first_design else body.FIRST_DESIGNS
+
+
+def episodes_of_designs(body: type[MorphEnv], settings: Settings) -> list[int]:
+    """Training episodes of each design."""
+    num_first = min(len(first_designs(body, settings)), settings.num_designs)
+    return [settings.first_episodes] * num_first + [settings.episodes] * (settings.num_designs - num_first)
 
 
 def make_generator(env: MorphEnv, settings: Settings) -> DesignGenerator | None:
@@ -141,7 +159,7 @@ def make_search(env: MorphEnv, settings: Settings, *, seed: int) -> DesignSearch
 
 def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
     """Four buffers that can hold everything this run will ever put into them."""
-    episodes = [episodes_of(settings, index) for index in range(settings.num_designs)] or [1]
+    episodes = episodes_of_designs(type(env), settings)
     population = batch_parts(settings.batch_size, imagined=settings.imagined_share)
     individual = batch_parts(
         settings.batch_size, imagined=settings.individual_imagined_share, other=settings.individual_mix

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import sys
 import time
 from typing import TextIO
+
+import torch
+from torch import Tensor
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
@@ -24,7 +26,7 @@ class Progress:
         updates: network updates after each episode, for the speed.
         imagined_share: of a population batch.
         done: episodes that were over before.
-        best: return of the present design before, if there is one.
+        best: return of each run on the present design before, ``[K]``, if there is one.
         stream: where to write; None takes standard output.
         quiet: write nothing.
     """
@@ -37,7 +39,7 @@ class Progress:
         updates: int,
         imagined_share: float = 0.0,
         done: int = 0,
-        best: float = -math.inf,
+        best: Tensor | None = None,
         stream: TextIO | None = None,
         quiet: bool = False,
     ) -> None:
@@ -50,7 +52,7 @@ class Progress:
     def show(self, event: DesignChosen | EpisodeDone | DesignDone) -> None:
         """Write the line of an episode, and warn of what went wrong in it; other events move the state only."""
         if isinstance(event, DesignChosen):
-            self._best = -math.inf
+            self._best = None
         if not isinstance(event, EpisodeDone):
             return
         for sentence in mishaps(event):
@@ -58,9 +60,9 @@ class Progress:
         if self._quiet:
             return
         self._episodes += 1
-        last = float(event.evaluation_return.nanmean())
-        self._best = max(self._best, last)
-        long, short = self._lines(event, last)
+        last = event.evaluation_return.cpu()
+        self._best = last if self._best is None else torch.fmax(self._best, last)
+        long, short = self._lines(event, last, self._best)
         if self._live:
             width = shutil.get_terminal_size().columns - 1
             line = long if len(long) <= width else short
@@ -74,10 +76,10 @@ class Progress:
         self.end()
         print(f"warning: {sentence}", file=sys.stderr)
 
-    def _lines(self, event: EpisodeDone, last: float) -> tuple[str, str]:
+    def _lines(self, event: EpisodeDone, last: Tensor, best: Tensor) -> tuple[str, str]:
         """The line in full, and in about 75 characters."""
         design, episode = f"{event.index + 1}/{self._num_designs} {event.kind}", event.episode + 1
-        returns = f"{last:.1f} (best {self._best:.1f})"
+        returns = f"{_mean(last):.1f} (best {_mean(best):.1f})"
         error = event.metrics.get("model_error")
         mean_error = "-" if error is None else f"{float(error.nanmean()):.3f}"
         speed = f"{self._updates / event.seconds['episode']:.0f}"
@@ -118,6 +120,11 @@ def mishaps(event: EpisodeDone) -> list[str]:
                 f"with the weights of before and gets no more rows; {left} of {len(event.design)} run(s) go on"
             )
     return found
+
+
+def _mean(returns: Tensor) -> float:
+    """Over the runs that have one."""
+    return float(returns[returns.isfinite()].mean())
 
 
 def _clock(seconds: float) -> str:

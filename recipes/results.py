@@ -19,7 +19,7 @@ from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
 from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
-from recipes.writing import write_whole
+from recipes.writing import shortest, write_whole
 
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
 
@@ -217,8 +217,8 @@ def format_row(row: Sequence[str]) -> str:
 
 
 def _cell(value: Any) -> Any:
-    """Seven significant digits hold a float32; a missing value is an empty cell."""
-    return f"{value:.7g}" if isinstance(value, float) else "" if value is None else value
+    """As a CSV file has it; a missing value is an empty cell."""
+    return shortest(value) if isinstance(value, float) else "" if value is None else value
 
 
 def versions() -> dict[str, str]:
@@ -240,11 +240,14 @@ def describe(environment: str, settings: Settings) -> dict[str, Any]:
 
 
 def note_resumption(folder: Path, settings: Settings) -> None:
-    """Write into ``config.json`` that the run went on, when, and with which other settings."""
+    """Write into ``config.json`` that the run went on: when, by which code, and with which other settings."""
     config = read_config(folder)
     moved = changes(saved_settings(folder), settings)
     config["settings"] = plain(dataclasses.replace(settings, resume=None))
-    config["resumed"] = [*config.get("resumed", []), {"at": now(), "changed": moved}]
+    config["resumed"] = [
+        *config.get("resumed", []),
+        {"at": now(), "revision": git_revision(), "versions": versions(), "changed": moved},
+    ]
     write_whole(folder / "config.json", json.dumps(config, indent=2) + "\n")
 
 

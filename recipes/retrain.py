@@ -43,7 +43,7 @@ from recipes.studies.conduct import (
     without_words_of_ray,
 )
 from recipes.studies.definition import Cell
-from recipes.writing import write_whole
+from recipes.writing import shortest, write_whole
 
 RULE = {"top": 0.5, "most": 18}  # of Fig. 2
 DEFAULT = ", as the study gave to a first design (the paper: 300); --episodes takes another number"
@@ -56,8 +56,8 @@ class Retrain:
 
     study: tyro.conf.Positional[Path]
     """Folder of the study."""
-    arms: tuple[str, ...] = ("none", "known")
-    """Whose designs."""
+    arms: tuple[str, ...] = ()
+    """Whose designs; by default those of all arms of the study that search for them (Fig. 2 has none and known)."""
     top: float | None = None
     """Share of each run's optimised designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
     most: int | None = None
@@ -164,14 +164,14 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
     for arm in asked.arms:
         if arm not in runs.arms:
             raise ValueError(f"{arm!r} is no arm of {asked.study}; name some of its own: --arms {' '.join(runs.arms)}")
-    rule = rule_of(lines, asked)
+    rule, arms = rule_of(lines, asked), asked.arms or runs.arms
     for place in runs.places:
         there = {line["arm"] for line in lines if (line["environment"], line["task"]) == place}
-        lines += best_designs(runs, place, [arm for arm in asked.arms if arm not in there], rule)
+        lines += best_designs(runs, place, [arm for arm in arms if arm not in there], rule)
     if not lines:
-        raise ValueError(f"no run of {', '.join(asked.arms)} has an optimised design yet; let the study go on")
+        raise ValueError(f"no run of {', '.join(arms)} has an optimised design yet; let the study go on")
     there = {(line["environment"], line["task"], line["arm"]) for line in lines}
-    for place, arm in itertools.product(runs.places, asked.arms):
+    for place, arm in itertools.product(runs.places, arms):
         if arm in runs.arms_at(place) and (*place, arm) not in there:
             print(f"{', '.join(place)}: no run of {arm} has an optimised design, there is nothing to retrain of it")
     text = io.StringIO()
@@ -209,13 +209,17 @@ def best_designs(runs: Runs, place: Place, arms: Sequence[str], rule: Mapping[st
         place: environment and task.
         arms: whose designs.
         rule: ``top``, the share, and ``most``, which is divided among the runs of the arm that has most of them, so
-            that all arms select alike.
+            that all arms select alike; where it does not come out even, the first seeds give one more.
     """
-    most_of_run = max(1, int(rule["most"]) // max(runs.planned[*place, arm] for arm in runs.arms_at(place)))
+    each, more = divmod(int(rule["most"]), max(runs.planned[*place, arm] for arm in runs.arms_at(place)))
     share = Fraction(str(rule["top"]))  # 7 / 25 * 25 > 7 in floating point
     for arm in arms:
         found = [candidates(run) for run in runs.of(place, arm)]
-        kept = [pair for own in found for pair in own[: min(most_of_run, math.ceil(share * len(own)))]]
+        kept = [
+            pair
+            for i, own in enumerate(found)
+            for pair in own[: min(max(1, each + (i < more)), math.ceil(share * len(own)))]
+        ]
         noted = {"over": sum(run.over for run in runs.of(place, arm)), "planned": runs.planned[*place, arm]}
         noted |= {"found": sum(map(len, found)), "kept": len(kept), **rule}
         for run, row in sorted(kept, key=lambda pair: -pair[1]["best_return"]):
@@ -240,8 +244,8 @@ def line_of(run: Run, row: Row) -> Line:
         "seed": str(run.seed),
         "run": str(run.number),
         "design": str(row["design"]),
-        "xi": " ".join(f"{value:.7g}" for value in row["xi"]),
-        "found_return": f"{row['best_return']:.7g}",
+        "xi": " ".join(shortest(value) for value in row["xi"]),
+        "found_return": shortest(row["best_return"]),
     }
 
 

@@ -29,7 +29,7 @@ class Settings:
     dream: Literal["ensemble", "simulator"] = "ensemble"
     """Who imagines: the learnt ensemble, or the simulator itself, which tells the ensemble's error from the rest."""
     bodies: Literal["search", "random", "fixed"] = "search"
-    """Bodies after the first ones: optimised and random in turn, all random, or the body as drawn from start to end."""
+    """Bodies after the first ones: optimised and random in turn, all random, or the first one from start to end."""
     first_design: tuple[float, ...] = ()
     """One body to begin with, as scale factors, instead of the environment's own five."""
     sigma: float = 0.1
@@ -263,9 +263,3 @@ def refuse_changes(old: Settings, new: Settings) -> None:
             f"num_designs was {old.num_designs} and can only grow, not shrink to {new.num_designs}; to end a run "
             "early, stop it"
         )
-
-
-def episodes_of(settings: Settings, index: int) -> int:
-    """Training episodes of one design."""
-    num_first = 1 if settings.first_design else 5
-    return settings.first_episodes if index < num_first else settings.episodes

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from test_buffers import filled, keys_of, make_rows
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from coim.batches import BatchParts, batch_parts, sample_batches, sample_mixed, sample_mixture
+from coim.batches import BatchParts, batch_parts, sample_batches, sample_mixture
 from coim.buffers import ROW_KEYS, TransitionBuffer
+
+
+def mixed(
+    real: TensorDictReplayBuffer, imagined: TensorDictReplayBuffer, share: float = 0.2, num_batches: int = 1
+) -> TensorDict:
+    """The population's batches (Sec. 5)."""
+    parts = batch_parts(256, imagined=share)
+    return sample_mixture([(real, parts.own), (imagined, parts.imagined)], num_batches, imagined=imagined)
 
 
 def test_every_run_sees_its_own_rows_only() -> None:
@@ -36,7 +45,7 @@ def test_a_buffer_draws_from_its_own_generator_and_from_nothing_else() -> None:
 
 def test_the_default_mixture_is_205_real_and_51_imagined_rows_in_every_batch() -> None:
     real, imagined = filled(300, 2), filled(80, 2, first=500)
-    batches = sample_mixed(real, imagined, num_batches=7)
+    batches = mixed(real, imagined, num_batches=7)
     assert batches.batch_size == (7, 256, 2)
     assert keys_of(batches) == {*ROW_KEYS, "imagined"}
     assert batches["imagined"].dtype == torch.bool
@@ -47,13 +56,13 @@ def test_the_default_mixture_is_205_real_and_51_imagined_rows_in_every_batch() -
 
 @pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (1.0, 256), (0.5, 128), (0.1, 26)])
 def test_a_share_is_rounded_to_rows(share: float, expected: int) -> None:
-    assert sample_mixed(filled(9), filled(9), share=share)["imagined"].sum() == expected
+    assert mixed(filled(9), filled(9), share)["imagined"].sum() == expected
 
 
 def test_a_buffer_without_a_share_may_be_empty() -> None:
     empty = TransitionBuffer(5, seed=0)
-    assert not sample_mixed(filled(9), empty, share=0.0)["imagined"].any()
-    assert sample_mixed(empty, filled(9), share=1.0)["imagined"].all()
+    assert not mixed(filled(9), empty, 0.0)["imagined"].any()
+    assert mixed(empty, filled(9), 1.0)["imagined"].all()
 
 
 def test_a_mixture_of_three_buffers_keeps_their_order_and_marks_one() -> None:
@@ -68,18 +77,18 @@ def test_a_mixture_of_three_buffers_keeps_their_order_and_marks_one() -> None:
 def test_stock_buffers_of_torchrl_can_be_mixed_too() -> None:
     stock = TensorDictReplayBuffer(storage=LazyTensorStorage(10))
     stock.extend(make_rows(10))
-    assert sample_mixed(stock, filled(9))["imagined"].sum() == 51
+    assert mixed(stock, filled(9))["imagined"].sum() == 51
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_outside_of_0_to_1_is_refused(share: float) -> None:
     with pytest.raises(ValueError, match=rf"share is {share}, it must lie in \[0, 1\]"):
-        sample_mixed(filled(9), filled(9), share=share)
+        batch_parts(256, imagined=share)
 
 
 def test_a_batch_smaller_than_its_parts_is_refused() -> None:
     with pytest.raises(ValueError, match="a batch of 2 rows is smaller than its parts"):
-        sample_mixed(filled(9), filled(9), batch_size=2, share=0.2)
+        batch_parts(2, imagined=0.2)
     with pytest.raises(ValueError, match="need 13"):
         batch_parts(10, imagined=0.7, other=0.6)
     with pytest.raises(ValueError, match="a batch of 0 rows"):

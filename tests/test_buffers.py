@@ -134,6 +134,22 @@ def test_rows_that_do_not_fit_are_refused() -> None:
         TransitionBuffer(0, seed=0)
 
 
+def test_a_state_that_does_not_fit_changes_nothing() -> None:
+    def make(capacity: int, num_runs: int = 1) -> Buffers:
+        sizes = {"pop_capacity": capacity, "ind_capacity": 9, "s0_capacity": 9, "art_capacity": 9}
+        return Buffers.for_env(cast(EnvBase, SimpleNamespace(batch_size=torch.Size([num_runs]))), **sizes, seed=0)
+
+    small, large = make(5), make(12)
+    for buffers in (small, large):
+        buffers.ind.extend(make_rows(2, first=float(buffers.pop.capacity)))
+    large.pop.extend(make_rows(12))
+    with pytest.raises(ValueError, match=r"holds 12 rows of 1 run\(s\), this buffer has room for 5 of 1"):
+        small.load_state_dict(large.state_dict())
+    assert small.ind[:]["observation"][0, 0, 0] == 5
+    with pytest.raises(ValueError, match=r"12 rows of 1 run\(s\), this buffer has room for 12 of 2"):
+        make(12, num_runs=2).load_state_dict(large.state_dict())
+
+
 @pytest.mark.parametrize(("stored", "capacity"), [(4, 9), (6, 9), (8, 9), (8, 6), (4, 6)])
 def test_a_larger_buffer_goes_on_behind_the_newest_row(stored: int, capacity: int) -> None:
     small, large = TransitionBuffer(6, seed=0), TransitionBuffer(capacity, seed=1)

@@ -232,6 +232,7 @@ def test_a_caller_can_stop_at_any_event() -> None:
         ({"individual_mix": 0.7, "individual_imagined_share": 0.6}, "need 13"),
         ({"first_designs": torch.ones(2, 3)}, r"first_designs has shape \[2, 3\], expected \[I, 4\]"),
         ({"first_designs": torch.full((1, 4), 3.0)}, "leaves"),
+        ({"bodies": "serach"}, "bodies='serach' is unknown; choose 'search', 'random' or 'fixed'"),
         ({"dream": None}, "both a dream and a generator"),
     ],
 )

@@ -94,6 +94,44 @@ def test_compiled_float32_updates_of_a_fleet_equal_the_plain_ones(make_rows: Row
         torch.testing.assert_close(weights(quick)[key], value, rtol=0, atol=limit)
 
 
+def test_a_fleet_of_one_learns_as_a_single_run(make_rows: Rows) -> None:
+    fleet, alone = sac_learner(1), sac_learner()
+    for network, other in ((fleet.policy, alone.policy), (fleet.qvalue, alone.qvalue)):
+        for own, given in zip(network.parameters(), other.parameters(), strict=True):
+            own.data.copy_(given.data)
+    fleet.start_from(fleet)
+    batches = make_rows(3, 8, 1)
+    expected = alone.update(batches.squeeze(-1))
+    for key, value in fleet.update(batches).items():
+        torch.testing.assert_close(value, expected[key], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("num_runs", "batch", "message"),
+    [
+        (2, (1, 2, 12), r"\[1, 2, 12\] needs num_runs=2 as its last dimension"),  # as a rollout is, [K, T]
+        (2, (3, 4), r"\[3, 4\] needs num_runs=2"),
+        (None, (3, 0), "has no rows"),
+    ],
+)
+def test_rows_of_one_run_never_count_as_anothers(
+    make_rows: Rows, num_runs: int | None, batch: tuple[int, ...], message: str
+) -> None:
+    learner = sac_learner(num_runs)
+    before = weights(learner)
+    with pytest.raises(ValueError, match=message):
+        learner.update(make_rows(*batch))
+    assert all(torch.equal(value, before[key]) for key, value in weights(learner).items())
+
+
+@pytest.mark.parametrize("which", ["policy", "qvalue"])
+def test_networks_that_were_moved_are_not_trained_in_silence(make_rows: Rows, which: str) -> None:
+    learner = sac_learner()
+    getattr(learner, which).float().double()
+    with pytest.raises(RuntimeError, match="moved after their learner was made; make the learner last"):
+        learner.update(make_rows(1, 4))
+
+
 def test_the_input_is_left_untouched(make_rows: Rows) -> None:
     batches = make_rows(2, 8)
     before = batches.clone()

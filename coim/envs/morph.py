@@ -74,6 +74,7 @@ class MorphEnv(EnvBase):
     FRAME_SKIP: ClassVar[int]  # simulation steps in an environment step
     RESET_NOISE: ClassVar[float]
     OBSERVATION_SCALE: ClassVar[tuple[float, ...]]  # standard deviations under random actions at xi = 1, rounded
+    FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]]  # that a recipe's run tries first
 
     _first_position = 1  # of qpos in the observation: the root's x is left out
 

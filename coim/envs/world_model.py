@@ -100,11 +100,13 @@ class WorldModelEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         if tensordict is not None:
             given = tensordict.select("observation", "design", strict=False)
-            self._check_start(given)
-            # Rows that are not reset keep their state: EnvBase.reset merges what is returned here by `_reset`.
-            self._start.update(given.clone())
-        if len(self._start.keys()) < 2:
-            self._start = self._made_up_start().update(self._start)
+            everywhere = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+            which = tensordict.get("_reset", everywhere).reshape(self.batch_size)
+            self._check_start(given, which)
+            # Rows that are not reset keep the start that they had; EnvBase.reset leaves their state as it is.
+            kept = given if which.all() else self._begun().select(*given.keys())
+            self._start.update(given.where(which, kept))
+        self._start = self._begun()
         return self.full_done_spec.zero().update(self._start.clone())
 
     def _set_seed(self, seed: int | None) -> None:
@@ -122,28 +124,30 @@ class WorldModelEnv(EnvBase):
         self.reward_spec = env.full_reward_spec_unbatched.expand(*self.batch_size)
         self.done_spec = env.full_done_spec_unbatched.expand(*self.batch_size)
 
-    def _made_up_start(self) -> TensorDict:
-        """Draw a start for those who give none."""
+    def _begun(self) -> TensorDict:
+        """The starts of all rows: the last ones given, and made-up ones for those who gave none."""
+        if len(self._start.keys()) == 2:
+            return self._start
         low, high = self.design_spec.space.low, self.design_spec.space.high
         observation = self.observation_spec["observation"].zero()
         design = self.observation_spec["design"].zero()
         uniform = torch.rand(design.shape, generator=self.rng, device=design.device, dtype=design.dtype)
         start = {"observation": observation.normal_(generator=self.rng), "design": low + (high - low) * uniform}
-        return TensorDict(start, self.batch_size, device=self.device)
+        return TensorDict(start, self.batch_size, device=self.device).update(self._start)
 
-    def _check_start(self, start: TensorDictBase) -> None:
-        """Say which entry of a start cannot be dreamt from."""
+    def _check_start(self, start: TensorDictBase, which: Tensor) -> None:
+        """Say which entry of a start cannot be dreamt from, in the rows that are reset."""
         for key, value in start.items():
             if value.shape != self.observation_spec[key].shape:
                 raise ValueError(
                     f"start {key} has shape {list(value.shape)}, not {list(self.observation_spec[key].shape)}"
                 )
-            if not value.isfinite().all():
-                raise ValueError(f"start {key} holds {value[~value.isfinite()][0].item()}; give finite numbers")
+            if (strange := value[which & ~value.isfinite().all(-1)]).numel():
+                raise ValueError(f"start {key} holds {strange[~strange.isfinite()][0].item()}; give finite numbers")
         if (design := start.get("design", None)) is None:
             return
         low, high = self.design_spec.space.low, self.design_spec.space.high
-        outside = ((design < low) | (design > high)).any(-1)
+        outside = which & ((design < low) | (design > high)).any(-1)
         if outside.any():
             raise ValueError(
                 f"design {design[outside][0].tolist()} leaves [{low.tolist()}, {high.tolist()}]; project it with "

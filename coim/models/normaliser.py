@@ -59,7 +59,12 @@ class RunningNormaliser(nn.Module):
 
         Args:
             rows: ``[*B, (K,) F]``, any number of them.
+
+        Raises:
+            ValueError: if they do not end in ``[(K,) F]``: the rows of one run would count as another's.
         """
+        if rows.shape[-self.mean.ndim :] != self.mean.shape:
+            raise ValueError(f"rows of shape {list(rows.shape)} must end in {list(self.mean.shape)}")
         rows = rows.to(self.mean.dtype).reshape(-1, *self.mean.shape)
         if not len(rows):
             return

@@ -26,6 +26,7 @@ GRAVITY = 9.8  # m/s^2
 CART_MASS = 1.0  # kg
 LENGTH, POLE_MASS = 1.0, 0.1  # m, kg: Gymnasium's body, whose `length` of 0.5 m is half the pole
 LENGTHS, MASSES = np.linspace(0.2, 4.0, 39), np.linspace(0.05, 2.0, 40)
+MARGIN = 0.08  # of a panel's side, in which no number has room
 # Angle from the vertical in rad, angular velocity in rad/s, force on the cart in N.
 STATES = ((0.2, 0.0, 10.0), (0.2, 3.0, 0.0), (0.8, 6.0, -10.0))
 
@@ -94,5 +95,8 @@ def draw(axes: Axes, lengths: np.ndarray, masses: np.ndarray, acceleration: np.n
     around = [withStroke(linewidth=1.5, foreground="black")]  # white alone is lost on the bright end of the colours
     for label in axes.clabel(lines, fontsize=7, fmt="%g"):
         label.set_path_effects(around)
+        x, y = (axes.transData + axes.transAxes.inverted()).transform(label.get_position())
+        if not (MARGIN < x < 1 - MARGIN and MARGIN < y < 1 - MARGIN):  # a number that is cut reads as another one
+            label.remove()
     axes.plot(LENGTH, POLE_MASS, "o", **CIRCLE)
     axes.set(xlabel="length of the pole (m)")

@@ -38,22 +38,8 @@ def plots(study: Path) -> Iterator[Plot]:
         yield missing(STEM, f"No model was looked into at the end of its run: {line}")
     for kind, (folder, *others) in found.items():
         name, rows = name_of(STEM, kind, found), read(folder / FILE)
-        rows, left_out = with_area(rows)
-        if not rows:
-            yield missing(name, f"{folder / FILE} has no plane to draw: beside the own design all is out of bounds.")
-            continue
-        caption = describe(kind, rows) + " " + told_of(folder, others, left_out, study)
+        caption = describe(kind, rows) + " " + told_of(folder, others, study)
         yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption)
-
-
-def with_area(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
-    """Rows of the states whose plane is more than a point or a line, and the other states."""
-    left_out = []
-    for state in sorted({row["state"] for row in rows}, key=int):
-        grid = [row for row in rows if row["state"] == state and row["point"] == "grid"]
-        if any(len({float(row[key]) for row in grid}) < 2 for key in ("pc_1", "pc_2")):
-            left_out.append(state)
-    return [row for row in rows if row["state"] not in left_out], left_out
 
 
 def drawn(rows: Sequence[Row]) -> Figure:
@@ -127,10 +113,7 @@ def describe(kind: Kind, rows: Sequence[Row]) -> str:
     )
 
 
-def told_of(folder: Path, others: Sequence[Path], left_out: Sequence[str], study: Path) -> str:
-    """Whose models these are, and which states and runs are not drawn."""
+def told_of(folder: Path, others: Sequence[Path], study: Path) -> str:
+    """Whose models these are, and which runs are not drawn."""
     first, *rest = (path.relative_to(study).as_posix() for path in (folder, *others))
-    told = f"Of {first}" + (f", the first by name; not drawn: {', '.join(rest)}." if rest else ".")
-    if left_out:
-        told += f" Not drawn, because beside the own design all is out of bounds: state {', '.join(left_out)}."
-    return told
+    return f"Of {first}" + (f", the first by name; not drawn: {', '.join(rest)}." if rest else ".")

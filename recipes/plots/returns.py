@@ -26,11 +26,11 @@ PANEL = (3.6, 2.3)  # inches
 CAPTION = (
     "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
     "over the evaluation episodes on it. After the first designs, which are given, those that maximise Q and random "
-    "ones take turns. Faint: single runs. Strong: mean and interquartile mean (IQM) of those that have reached the "
-    "design. "
-    f"Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
+    "ones take turns{exceptions}. Faint: single runs. Strong: mean and interquartile mean (IQM) of those that have "
+    f"reached the design. Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
     "environment, task and arm). "
 )
+EXCEPTIONS = {"random-bodies": "takes random ones only", "control-only": "has one body all the time"}
 
 
 def plots(study: Path) -> Iterator[Plot]:
@@ -49,8 +49,9 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
     drawn = [arm for arm in arms if any(run.designs for run in runs.found if run.arm == arm)]
     if not drawn:
         return missing(name, f"No run of {' or '.join(arms) or 'its arms'} has finished a design yet.")
-    panels = arranged(runs.places)
-    figure = Figure(figsize=(PANEL[0] * len(panels[0]), 0.6 + PANEL[1] * len(panels)), layout="constrained")
+    panels = arranged([place for place in runs.places if {*arms} & {*runs.arms_at(place)}])
+    height = 0.4 + 0.2 * math.ceil(len(drawn) / 4) + PANEL[1] * len(panels)  # a line of the legend has room for four
+    figure = Figure(figsize=(PANEL[0] * len(panels[0]), height), layout="constrained")
     grid = figure.subplots(len(panels), len(panels[0]), squeeze=False, sharex="col")
     rows: list[dict[str, object]] = []
     first: dict[Place, Axes] = {}  # panels of one place share their limits
@@ -70,7 +71,13 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
     if any(run.diverged for run in runs.found if run.arm in drawn):
         entries.append(Line2D([], [], marker="x", color=GREY, linestyle="", label="diverged after this design"))
     put_legend(figure, entries)
-    return Plot(name=name, figure=figure, rows=rows, caption=CAPTION + runs.in_words(arms))
+    return Plot(name=name, figure=figure, rows=rows, caption=caption_of(drawn) + runs.in_words(arms, counted=True))
+
+
+def caption_of(arms: Sequence[str]) -> str:
+    """What is seen of these arms."""
+    told = ", ".join(f"{arm} {words}" for arm, words in EXCEPTIONS.items() if arm in arms)
+    return CAPTION.format(exceptions=f" ({told})" if told else "")
 
 
 def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:
@@ -108,7 +115,7 @@ def draw_panel(
         if label == "mean":  # the single runs are the same in both panels
             rows += [row for run in own for row in rows_of(run)]
     if axes.lines:
-        axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design, {label} (1)")
+        axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design,\n{label} (1)")
         axes.spines[["top", "right"]].set_visible(False)
         axes.xaxis.get_major_locator().set_params(integer=True)
     return bool(axes.lines)

@@ -120,8 +120,13 @@ class Runs:
         own = [run for run in self.found if (run.environment, run.task) == place]
         return min((row["best_return"] for run in own for row in run.designs), default=math.nan)
 
-    def in_words(self, arms: list[str]) -> str:
-        """How many of how many runs are over, and what is to be known of those that are not, or diverged."""
+    def in_words(self, arms: list[str], *, counted: bool = False) -> str:
+        """How many of how many runs are over, and what is to be known of those that are not, or diverged.
+
+        Args:
+            arms: of the runs.
+            counted: whether something is shown in which diverged runs count on designs that they did not reach.
+        """
         own = [run for run in self.found if run.arm in arms]
         states = Counter(run.state for run in own)
         over, diverged, under_way = states["finished"] + states["diverged"], states["diverged"], states["under way"]
@@ -137,16 +142,19 @@ class Runs:
             words += f", {given_up} failed (ledger.csv says why)" * bool(given_up)
         lengths = sorted({run.num_designs for run in own})
         longer = f" They are to try different numbers of designs: {', '.join(map(str, lengths))}." * (len(lengths) > 1)
-        return f"{words}; {self._diverged_in_words(own, under_way) if diverged else 'none diverged'}.{longer}"
+        how = self._diverged_in_words(own, under_way, counted) if diverged else "none diverged"
+        return f"{words}; {how}.{longer}"
 
-    def _diverged_in_words(self, own: list[Run], under_way: int) -> str:
+    def _diverged_in_words(self, own: list[Run], under_way: int, counted: bool) -> str:
         """What diverging means, and what it does to the numbers."""
         broken = [run for run in own if run.diverged]
         places = dict.fromkeys((run.environment, run.task) for run in broken)
         values = "; ".join(f"{', '.join(place)}: {number(self.failure(place))}" for place in places)
-        words = (
-            f"{len(broken)} of them diverged (a loss, weight or moment became no finite number, or a weight huge) "
-            "and count, on each design that they did not reach, with the lowest best return that any run of the "
+        words = f"{len(broken)} of them diverged (a loss, weight or moment became no finite number, or a weight huge)"
+        if not counted:
+            return f"{words}; what is shown of them is of the designs that they reached"
+        words += (
+            " and count, on each design that they did not reach, with the lowest best return that any run of the "
             f"environment and task has on a design ({values}), on which the means and Welch's test depend"
         )
         if under_way:

@@ -18,7 +18,7 @@ from recipes.plots.runs import Place, Runs, read_runs
 from recipes.reporting.curves import new_figure
 from recipes.reporting.palette import BLACK, GREY, put_legend
 
-LABELS = {"area": "area: mean best return of a design (1)", "final": "final: highest best return (1)"}
+LABELS = {"area": "area: mean best return\nof a design (1)", "final": "final: highest\nbest return (1)"}
 ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not"
 OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
 INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
@@ -44,7 +44,7 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
             rows += [summary(runs, place, arm, [m for m in own if m.run.arm == arm]) for arm in runs.arms_at(place)]
     if not places:
         return missing("statistics_arms", f"No run has tried all its designs yet. {runs.in_words(runs.arms)}")
-    figure, grid = new_figure(0.4 + 2.4 * len(places), len(places), len(MEASURES))
+    figure, grid = new_figure(0.4 + (2.4 + room_for_names(runs.arms)) * len(places), len(places), len(MEASURES))
     axes_of = iter(grid)
     for place in places:
         for name in MEASURES:
@@ -53,14 +53,14 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
         "Runs that have tried all their designs, or diverged: points. Bars: interquartile means (IQM) and their "
         f"intervals; ticks: means. {INTERVALS}area: the mean over designs of a design's best return; final: the "
         "highest of all designs. search_gain: mean best return of the designs that maximised Q minus that of the "
-        "random ones, which take turns with them, mean over runs. rank_correlation: Spearman's, of Q(xi) before a body "
-        "was built and the best return on "
-        "it, over the bodies after the first ones, mean over runs; _given_order: the partial one with the order of "
-        "building held fixed, as Q and returns both rise while the networks learn. bias: (1 - gamma) Q(xi) - best "
-        "return / steps, both a reward per step, equal if the reward is constant, of bodies that maximised Q and of "
-        f"the random ones; {ENTROPY}. diverged_share: of the runs that have begun. hours: wall-clock of a run's cell; "
-        "hours and updates: mean over runs. "
-        f"{runs.in_words(runs.arms)}"
+        "random ones, which take turns with them, mean over runs. This and what follows, up to bias, is of the designs "
+        "that a run reached, and _runs the number of runs that have a value. rank_correlation: Spearman's, of Q(xi) "
+        "before a body was built and the best return on it, over the bodies after the first ones, mean over runs; "
+        "_given_order: the partial one with the order of building held fixed, as Q and returns both rise while the "
+        "networks learn. bias: (1 - gamma) Q(xi) - best return / steps, both a reward per step, equal if the reward is "
+        f"constant, of bodies that maximised Q and of the random ones; {ENTROPY}. diverged_share: of the runs that "
+        "have begun. hours: wall-clock of a run's cell; hours and updates: mean over runs. "
+        f"{runs.in_words(runs.arms, counted=True)}"
     )
     return Plot(name="statistics_arms", figure=figure, rows=rows, caption=caption, readable=True)
 
@@ -79,6 +79,7 @@ def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cell
         values = np.array([getattr(m, name.removeprefix("rank_")) for m in over])
         values = values[np.isfinite(values)]
         row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
+        row |= {f"{name}_runs": values.size}
     for name in ("hours", "updates"):
         row[name] = float(np.mean([getattr(m, name) for m in over])) if over else np.nan
     return row
@@ -103,8 +104,13 @@ def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequenc
 
 def name_arms(axes: Axes, arms: Sequence[str]) -> None:
     """Names below the columns; slanted where there is no room for them side by side."""
-    slanted = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if len(arms) > 4 else {}
+    slanted = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if room_for_names(arms) else {}
     axes.set_xticks(range(len(arms)), arms, **slanted)
+
+
+def room_for_names(arms: Sequence[str]) -> float:
+    """Inches that slanted names take from a panel; none where they stand side by side."""
+    return 0.5 * (len(arms) > 4)
 
 
 def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
@@ -131,7 +137,7 @@ def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
         "arms have runs, each resampled by itself. difference and welch_p: of the arms, Welch's t-test, two-sided; "
         "paired_difference and paired_p: of the runs that share their seed, paired t-test (with five pairs Wilcoxon's "
         "test cannot go below 0.0625); _holm: corrected by Holm over all tests of that kind by that measure in this "
-        f"table. {runs.in_words(runs.arms)}"
+        f"table. {runs.in_words(runs.arms, counted=True)}"
     )
     return Plot(name="statistics_pairs", figure=figure, rows=rows, caption=caption, readable=True)
 
@@ -199,7 +205,7 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
         for m in measured
     ]
     places = [place for place in runs.places if any((m.run.environment, m.run.task) == place for m in measured)]
-    figure, grid = new_figure(0.4 + 2.2 * len(places), len(places), 2)
+    figure, grid = new_figure(0.4 + (2.2 + room_for_names(runs.arms)) * len(places), len(places), 2)
     labels = {"hours": "wall-clock of the cell (h)", "updates": "updates (number)"}
     for axes, (place, name) in zip(grid, ((place, name) for place in places for name in labels)):
         here = [m for m in measured if (m.run.environment, m.run.task) == place]

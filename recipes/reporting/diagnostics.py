@@ -29,7 +29,7 @@ LOSSES = {  # column of metrics.csv behind the learner's name, and the words bes
     "loss_actor": "actor loss (1)",
     "loss_qvalue": "critic loss (1, squared)",
     "alpha_entropy": r"$\alpha\,\times$ entropy (nats)",
-    "loss_dynamics": "model loss, Eq. 6 (nats)",
+    "loss_dynamics": "model loss, Eq. 6 (1)",
 }
 
 

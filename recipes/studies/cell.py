@@ -16,6 +16,7 @@ from recipes.experiment import run
 from recipes.interrupt import LOCK
 from recipes.results import now
 from recipes.settings import FREE, Settings, plain, read_config, refuse_changes, saved_settings
+from recipes.writing import ASIDE
 
 STARTED = "started"  # how a line of a log begins with which a try began
 OF_NO_NUMBER = FREE | {"out", "device", "name"}  # a finished run is what it is wherever it was made and is called
@@ -44,16 +45,22 @@ def to_go_on(settings: Settings) -> Settings:
     """The settings with which a cell is begun, or with which its run is resumed; makes room for one that begins.
 
     Raises:
-        ValueError: see `resumed`.
+        ValueError: if the folder holds files of a run and no config.json; see also `resumed`.
     """
     folder = settings.out
     if folder is None:
         raise ValueError("a cell has a folder")
     if (going_on := resumed(settings, folder)) is not None:
         return going_on
-    for path in folder.glob("*") if folder.exists() else []:
-        if path.name != LOCK:  # what a process that was killed at once had not finished
-            path.unlink()
+    there = [path for path in folder.glob("*") if path.name != LOCK]
+    # config.json is the first file of a run; a process that was killed before left it half written.
+    if found := [path.name for path in there if path.name != ASIDE.format("config.json")]:
+        raise ValueError(
+            f"{folder} holds {', '.join(sorted(found))} and no config.json; put that back from a copy, or move the "
+            "folder away to begin anew"
+        )
+    for path in there:
+        path.unlink()
     return settings
 
 

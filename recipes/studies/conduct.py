@@ -25,7 +25,9 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is import
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from recipes.settings import Settings, episodes_of
+from coim.envs import BODIES
+from recipes.parts import episodes_of_designs
+from recipes.settings import Settings
 from recipes.studies.cell import compute, episodes_done, resumed, seconds_of, still_finished, tries
 from recipes.studies.definition import Cell
 from recipes.studies.ledger import Ledger
@@ -274,7 +276,7 @@ def lacking(resources: Resources) -> str:
 
 def all_episodes(cell: Cell) -> int:
     """Training episodes of a whole cell."""
-    return sum(episodes_of(cell.settings, index) for index in range(cell.settings.num_designs))
+    return sum(episodes_of_designs(BODIES[cell.environment], cell.settings))
 
 
 def in_words(seconds: float) -> str:

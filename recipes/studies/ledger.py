@@ -117,4 +117,7 @@ def read_ledger(path: Path) -> list[Entry]:
                 for row in csv.DictReader(file)
             ]
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}); delete it, and what is finished is found again") from None
+        raise ValueError(
+            f"{path} is damaged ({error}); put it back from a copy, or delete it, and what is finished is found again "
+            "by its checkpoints"
+        ) from None

@@ -125,6 +125,21 @@ def test_a_partial_reset_leaves_the_other_rows_alone() -> None:
     assert torch.equal(after["design"], start["design"])
 
 
+def test_rows_that_are_not_reset_keep_their_start_and_may_hold_anything() -> None:
+    dream, start = make_dream(3), start_of(3)
+    dream.reset(start.clone())
+    other = TensorDict({"observation": torch.full((3, 3), 5.0), "design": torch.full((3, 2), 0.7)}, [3])
+    other["observation"][2] = torch.nan
+    other["design"][0] = 9.0
+    dream.reset(other.clone().set("_reset", torch.tensor([[False], [True], [False]])))
+    again = dream.reset()
+    for key in ("observation", "design"):
+        assert torch.equal(again[key][1], other[key][1])
+        assert torch.equal(again[key][[0, 2]], start[key][[0, 2]])
+    with pytest.raises(ValueError, match="start observation holds nan"):
+        dream.reset(other.set("_reset", torch.tensor([[False], [False], [True]])))
+
+
 def test_a_horizon_starts_the_dream_again_from_its_start_states() -> None:
     dream, start = make_dream(3), start_of(3)
     env = TransformedEnv(dream, StepCounter(max_steps=4))

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from coim.models import RunningNormaliser
@@ -21,6 +22,13 @@ def test_each_run_has_statistics_of_its_own():
     torch.testing.assert_close(fleet.mean[1], alone.mean)
     torch.testing.assert_close(fleet.std[1], alone.std)
     torch.testing.assert_close(fleet(rows)[:, :, 1], alone(rows[:, :, 1]))
+
+
+def test_rows_without_the_run_axis_in_its_place_are_refused():
+    normaliser = RunningNormaliser(3, num_runs=2)
+    with pytest.raises(ValueError, match=r"rows of shape \[2, 5, 3\] must end in \[2, 3\]"):
+        normaliser.update(torch.zeros(2, 5, 3))
+    assert normaliser.count.sum() == 0
 
 
 def test_before_any_row_nothing_is_changed():

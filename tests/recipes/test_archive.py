@@ -9,6 +9,7 @@ import pytest
 
 from recipes.archive import main
 from recipes.figures import write_figures
+from recipes.plots.runs import read_runs
 from recipes.settings import plain
 from recipes.studies.conduct import Resources, take_up
 from recipes.studies.definition import Study
@@ -119,6 +120,15 @@ def test_a_run_that_is_over_is_finished_whatever_the_ledger_says_and_a_message_i
     main([str(study), str(tmp_path / "kept")])
     row = read_table(tmp_path / "kept" / "ledger.csv")[0]
     assert (row["cell"], row["state"], row["message"]) == (cells[0].name, "finished", "")
+
+
+def test_a_run_that_was_given_up_stays_so_and_is_tried_again_by_who_goes_on(study: Path, tmp_path: Path) -> None:
+    Ledger(study / "ledger.csv", STUDY.cells()).note(UNDER_WAY, "failed", tries=3, message=f"OSError in {tmp_path}")
+    main([str(study), str(tmp_path / "kept")])
+    row = {row["cell"]: row for row in read_table(tmp_path / "kept" / "ledger.csv")}[UNDER_WAY]
+    assert (row["state"], row["tries"], row["message"]) == ("failed", "3", "")
+    assert "1 failed" in read_runs(tmp_path / "kept").in_words(["none", "known"])
+    assert Ledger(tmp_path / "kept" / "ledger.csv", STUDY.cells()).in_state("waiting") == [UNDER_WAY]
 
 
 def test_what_cannot_be_kept_is_told(study: Path, tmp_path: Path) -> None:

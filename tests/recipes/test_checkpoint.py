@@ -97,6 +97,8 @@ def test_a_finished_run_can_be_resumed_and_given_more_designs(tmp_path: Path) ->
     config = json.loads((short / "config.json").read_text())
     assert config["settings"]["num_designs"] == 5
     assert [entry["changed"] for entry in config["resumed"]] == [{}, {"num_designs": [3, 5]}]
+    for entry in config["resumed"]:
+        assert (entry["revision"], entry["versions"]) == (config["revision"], config["versions"])
 
 
 def test_fewer_checkpoints_change_nothing_but_their_number(whole: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from coim import HopperMorph
 from coim.events import Kind
 from recipes.experiment import main
+from recipes.parts import episodes_of_designs, make_buffers
 from recipes.reporting.palette import KINDS
 from recipes.settings import PRESETS, Settings, parse
 
@@ -190,6 +191,16 @@ def test_a_simulator_without_designs_to_imagine_is_refused(capsys: pytest.Captur
     with pytest.raises(SystemExit):
         parse("hopper", "", ["--dream", "simulator", "--designs", "none"])
     assert "nothing to imagine with" in capsys.readouterr().err
+
+
+def test_a_body_may_have_more_first_designs_than_the_papers(tmp_path: Path) -> None:
+    class Hopper(HopperMorph):
+        FIRST_DESIGNS = (*HopperMorph.FIRST_DESIGNS, *HopperMorph.FIRST_DESIGNS[1:3])
+
+    settings = Settings(num_designs=9, first_episodes=3, episodes=2, episode_steps=6)
+    assert episodes_of_designs(Hopper, settings) == 7 * [3] + 2 * [2]
+    buffers = make_buffers(Hopper(), settings, seed=0)
+    assert (buffers.pop.capacity, buffers.s0.capacity) == (25 * 6, 25)
 
 
 def test_a_run_can_begin_with_one_body_of_its_own(tmp_path: Path) -> None:

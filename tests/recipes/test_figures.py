@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -188,6 +189,53 @@ def test_a_study_of_which_every_run_diverged_at_once_is_told_not_drawn(tmp_path:
     found = {plot.name: plot for plot in write_figures(tmp_path)}
     assert found["statistics_arms"].figure is None
     assert "1 of them diverged" in found["statistics_arms"].caption
+
+
+def test_the_caption_tells_what_other_arms_do_and_places_of_other_arms_have_no_panel(tmp_path: Path) -> None:
+    write_cell(tmp_path, "hopper-forward-control-only-0", [10, 20, 30, 40])
+    write_cell(tmp_path, "hopper-forward-none-0", [10, 20, 30, 40])
+    write_cell(tmp_path, "walker-forward-oracle-0", [10, 20, 30, 40])
+    figures = drawn(tmp_path)
+    assert {row["environment"] for row in figures["figure_1_best_returns"].rows} == {"hopper"}
+    figure = figures["figure_1_best_returns"].figure
+    assert figure is not None
+    assert "walker" not in " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
+    assert "(control-only has one body all the time)" in figures["best_returns_all_arms"].caption
+    assert "control-only" not in figures["figure_1_best_returns"].caption
+
+
+def test_figures_that_are_called_otherwise_now_leave_none_behind(study: Path) -> None:
+    write_figures(study)
+    page = study / "figures" / "README.md"
+    page.write_text(page.read_text() + "\n## figure_4a_model_error_hopper\n")
+    for suffix in ("png", "csv"):
+        (study / "figures" / f"figure_4a_model_error_hopper.{suffix}").touch()
+        (study / "figures" / f"mine.{suffix}").touch()
+    write_figures(study)
+    there = {path.stem for path in (study / "figures").iterdir()}
+    assert "figure_4a_model_error_hopper" not in there
+    assert there >= {"mine", "figure_1_best_returns"}
+
+
+def test_runs_of_several_revisions_are_told_on_the_page(study: Path) -> None:
+    write_figures(study)
+    page = study / "figures" / "README.md"
+    assert "All runs were made at revision unknown." in page.read_text()
+    for seed, revision in enumerate(("a" * 40, "b" * 40)):
+        path = study / "cells" / f"hopper-forward-none-{seed}" / "config.json"
+        config = json.loads(path.read_text()) | {"revision": revision}
+        config["resumed"] = [{"at": "then"}, {"at": "now", "revision": "c" * 40}][: 1 + seed]
+        path.write_text(json.dumps(config))
+    write_figures(study)
+    told = f"1 at {12 * 'a'}, 1 at {12 * 'b'} and {12 * 'c'}, 5 at unknown"
+    assert f"**Runs of different revisions are compared: {told}.**" in page.read_text()
+
+
+def test_a_folder_that_has_a_measured_run_alone_has_figure_4(tmp_path: Path) -> None:
+    (tmp_path / "model_error").mkdir()
+    main([str(tmp_path)])
+    assert (tmp_path / "figures" / "figure_4c_cartpole.png").is_file()
+    assert "figure_1" not in (tmp_path / "figures" / "README.md").read_text()
 
 
 def test_a_folder_that_is_no_study_is_refused_in_a_sentence(tmp_path: Path) -> None:

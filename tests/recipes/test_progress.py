@@ -85,6 +85,19 @@ def test_the_best_return_is_that_of_the_design() -> None:
     assert "design 2/2 first  episode 1  return 3.0 (best 3.0)  imagined 0%  model error -" in stream.getvalue()
 
 
+def test_the_best_of_a_fleet_is_the_mean_of_each_runs_best_also_of_one_that_goes_on() -> None:
+    def told(best: torch.Tensor | None, returns: list[list[float]]) -> str:
+        stream = io.StringIO()
+        progress = Progress(num_designs=1, total_episodes=9, updates=30, best=best, stream=stream)
+        for number, values in enumerate(returns):
+            progress.show(episode(0, number, values))
+        return stream.getvalue()
+
+    assert "return 5.0 (best 7.0)" in told(None, [[8.0, 2.0], [4.0, 6.0]])
+    assert "return 5.0 (best 7.0)" in told(torch.tensor([8.0, 2.0]), [[4.0, 6.0]])
+    assert "return 4.0 (best 4.0)" in told(torch.tensor([-torch.inf, -torch.inf]), [[4.0, float("nan")]])
+
+
 def test_a_run_that_has_no_number_is_left_out_of_the_mean() -> None:
     stream = io.StringIO()
     Progress(num_designs=1, total_episodes=2, updates=30, stream=stream).show(episode(0, 0, [float("nan"), 3.0]))

@@ -221,7 +221,7 @@ def test_rows_of_a_larger_study_that_never_came_to_them_are_dropped_and_a_damage
     assert len(take_up(tmp_path, study(seeds=(3,)).cells(), Resources()).entries) == 2
     assert len(read_ledger(tmp_path / "ledger.csv")) == 2
     (tmp_path / "ledger.csv").write_text("cell,environment\nhopper-forward-none-3,hopper\n")
-    with pytest.raises(ValueError, match=r"ledger.csv is damaged .*delete it, and what is finished is found again"):
+    with pytest.raises(ValueError, match=r"ledger.csv is damaged .*put it back from a copy, or delete it"):
         take_up(tmp_path, study(seeds=(3,)).cells(), Resources())
 
 
@@ -235,6 +235,25 @@ def test_tables_without_a_checkpoint_are_not_begun_anew_over(tmp_path: Path) -> 
     with pytest.raises(SystemExit, match="has the tables of a run and no checkpoint/ to go on from"):
         resume(folder)
     assert (folder / "evaluations.csv").read_bytes() == rows
+
+
+def test_a_folder_that_has_lost_its_config_is_not_emptied(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    cut(folder, 5)
+    (folder / "config.json").rename(tmp_path / "config.json")
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(ValueError, match=r"holds .*evaluations.csv.* and no config.json; put that back from a copy"):
+        to_go_on(dataclasses.replace(TINY, out=folder))
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_what_a_process_left_that_was_killed_at_once_is_begun_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / ".config.json.new").write_text('{"settings"')
+    settings = dataclasses.replace(TINY, out=folder)
+    assert to_go_on(settings) == settings
+    assert not list(folder.iterdir())
 
 
 def test_an_address_at_which_no_cluster_is_is_told_at_once(tmp_path: Path) -> None:

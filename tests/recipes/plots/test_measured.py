@@ -131,15 +131,13 @@ def test_over_the_last_quarter_a_measurement_counts_by_how_much_moves_in_it() ->
     assert math.isnan(late_share(rows, "next", "delta")[0])
 
 
-def write_planes(folder: Path, change: float, *flat: int) -> None:
-    """Two states of 2 x 2 points with one change everywhere; the plane of ``flat`` ones is a point."""
+def write_planes(folder: Path, change: float) -> None:
+    """Two states of 2 x 2 points with one change everywhere."""
     sources = ("delta", "next", "simulator")
     columns = ["state", "point", "pc_1", "pc_2", *(f"normalised/{source}" for source in sources), "depth"]
     lines = []
     for state in (1, 2):
-        for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            place = ("0", "-0") if state in flat else (x, y)
-            lines.append([state, "grid", *place, *[99 if state in flat else change] * 3, 0])
+        lines += [[state, "grid", x, y, change, change, change, 0] for x in (0, 1) for y in (0, 1)]
         lines.append([state, "tried", 0, 0, 0, 0, 0, 0])
     write_table(folder / FILE, [*columns, "share_1", "share_2"], [[*line, 0.7, 0.2] for line in lines])
 
@@ -153,17 +151,3 @@ def test_of_several_folders_the_first_is_looked_into_and_the_others_are_named(tm
     assert [float(str(plot.rows[0]["normalised/next"])) for plot in (backward, forward)] == [2, 1]
     assert "Of model_error/a, the first by name; not drawn: model_error/c." in forward.caption
     assert backward.caption.endswith("Of model_error/b.")
-
-
-def test_a_state_whose_plane_is_a_point_is_not_drawn_and_not_counted(tmp_path: Path) -> None:
-    folder = write_measured(tmp_path, "a", [1.0])
-    write_planes(folder, 1, 2)
-    (plot,) = design_space.plots(tmp_path)
-    assert len(plot.figure.axes) == 3 + 1
-    assert {row["state"] for row in plot.rows} == {"1"}
-    assert "possible: delta 1, next 1, simulator 1" in plot.caption
-    assert "all is out of bounds: state 2." in plot.caption
-    write_planes(folder, 1, 1, 2)
-    (plot,) = design_space.plots(tmp_path)
-    assert plot.figure is None
-    assert "has no plane to draw" in plot.caption

@@ -147,7 +147,10 @@ def test_what_a_diverged_run_counts_and_runs_of_different_length_are_told(tmp_pa
     write_cell(tmp_path, "hopper-forward-known-0", [10, 40], diverged=[0])
     write_cell(tmp_path, "hopper-forward-none-0", [-6, 10, 10, 10])
     write_cell(tmp_path, "hopper-forward-none-1", [8, 10], num_designs=6)
-    words = read_runs(tmp_path).in_words(["known", "none"])
+    runs = read_runs(tmp_path)
+    assert "1 of them diverged" in (short := runs.in_words(["known", "none"]))
+    assert "of the designs that they reached" in short
+    words = runs.in_words(["known", "none"], counted=True)
     assert "on a design (hopper, forward: -6), on which the means and Welch's test depend" in words
     assert "until all are over their arm looks worse than it is" in words
     assert words.endswith("They are to try different numbers of designs: 4, 6.")
