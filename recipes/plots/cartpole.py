@@ -92,11 +92,11 @@ def draw(axes: Axes, lengths: np.ndarray, masses: np.ndarray, acceleration: np.n
     """One state: colours, lines with numbers, the original body."""
     axes.pcolormesh(lengths, masses, acceleration, cmap="cividis", shading="gouraud", rasterized=True)
     lines = axes.contour(lengths, masses, acceleration, levels=8, colors="white", linewidths=0.7)
-    around = [withStroke(linewidth=1.5, foreground="black")]  # white alone is lost on the bright end of the colours
-    for label in axes.clabel(lines, fontsize=7, fmt="%g"):
+    around = [withStroke(linewidth=2.5, foreground="black")]  # white alone is lost on the bright end of the colours
+    for label in axes.clabel(lines, fontsize=7, fmt="%g", inline=False):
         label.set_path_effects(around)
         x, y = (axes.transData + axes.transAxes.inverted()).transform(label.get_position())
-        if not (MARGIN < x < 1 - MARGIN and MARGIN < y < 1 - MARGIN):  # a number that is cut reads as another one
-            label.remove()
+        if not (MARGIN < x < 1 - MARGIN and MARGIN < y < 1 - MARGIN):
+            label.remove()  # cut, it would read as another number
     axes.plot(LENGTH, POLE_MASS, "o", **CIRCLE)
     axes.set(xlabel="length of the pole (m)")
