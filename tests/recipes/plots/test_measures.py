@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from recipes.plots.measures import comparisons, measure, paired, pairs_of_arms, spearman, spearman_given, welch
+from recipes.plots.measures import (
+    comparisons,
+    detectable,
+    measure,
+    paired,
+    pairs_of_arms,
+    spearman,
+    spearman_given,
+    welch,
+)
 from recipes.plots.runs import parts_of, read_runs
 from recipes.reporting.records import Row
 from recipes.studies.definition import Study, to_json
@@ -173,6 +182,17 @@ def test_every_arm_meets_the_baseline_and_each_way_to_imagine_the_one_that_it_ch
         ("random", "known"),
         ("oracle", "random"),
     ]
+
+
+def test_the_detectable_difference_is_found_in_four_of_five_studies() -> None:
+    rng = np.random.default_rng(0)
+    x, y = np.array([1.0, 2.0, 6.0, 4.0, 3.0]), np.array([10.0, 30.0, 20.0])
+    difference, count = detectable(x, y), 4000
+    many_x = rng.normal(0.0, x.std(ddof=1), (count, len(x)))
+    many_y = rng.normal(difference, y.std(ddof=1), (count, len(y)))
+    found = stats.ttest_ind(many_x, many_y, axis=1, equal_var=False).pvalue < 0.05
+    assert found.mean() == pytest.approx(0.8, abs=0.03)  # the freedom of Welch's test is itself estimated
+    assert math.isnan(detectable(x[:1], y))
 
 
 def test_welch_is_the_hand_computed_one() -> None:
