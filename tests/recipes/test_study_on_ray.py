@@ -149,7 +149,7 @@ def test_a_cell_that_fails_is_tried_again_twice_and_the_others_are_computed(
 
 
 @pytest.mark.usefixtures("cluster")
-def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it_prints(
+def test_a_study_that_is_told_to_end_stops_at_once_and_goes_on_by_the_line_it_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     brief = Block(environments=("hopper",), arms=("known",), seeds=(0,), overrides={"num_designs": 1})
@@ -158,6 +158,7 @@ def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it
     folder = tmp_path / "my study"
     arguments = [str(tmp_path / "my.json"), "--out", str(folder), "--workers", "1"]
     temporary = {"TMPDIR": tempfile.mkdtemp(dir="/tmp")}
+    begun = time.monotonic()
     first = subprocess.Popen(
         [sys.executable, "-m", "recipes.study", *arguments],
         stdout=subprocess.PIPE,
@@ -176,7 +177,7 @@ def test_a_study_that_is_told_to_end_stops_in_seconds_and_goes_on_by_the_line_it
     meanwhile(folder, cells[0], rows=3, act=refuse_another_and_stop)
     out, err = first.communicate(timeout=100)
     ((pid, at),) = stopped
-    assert time.monotonic() - at < 10
+    assert time.monotonic() - at < at - begun  # sooner than it got under way, however slow the machine is
     assert first.returncode == 128 + signal.SIGTERM
     assert not Path(f"/proc/{pid}").exists()
     assert out.splitlines()[0] == f"test: 2 of 2 cells to compute -> {folder}"
