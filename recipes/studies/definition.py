@@ -31,7 +31,7 @@ PAPER = PRESETS["paper"]
 Protocol = Literal["paper", "preview", "smoke"]
 PROTOCOLS: dict[str, Settings] = {
     "paper": PAPER,
-    # About eight hours of one core, four of two, for the study of this name with its 26 runs: on the machine of
+    # About nine hours of one core, five of two, for the study of this name with its 26 runs: on the machine of
     # docs/results an episode takes 8 s without and 12.5 s with imagination, a seventh more when both cores are busy.
     # The first designs stay five, as they are the paper's; ten more let five be optimised; and six episodes each are
     # 6,000 updates of a controller that starts from the population's. Few episodes at the start would leave Eq. 5 to
