@@ -76,8 +76,8 @@ class SavedRun:
         settings: every setting, as ``config.json`` has it.
         bodies: K of them, with the run's task and length of an episode, ready to be reset with designs.
         population: pi_Pop and Q_Pop, which serve every design.
-        individual: pi_Ind and Q_Ind of the last design that an episode was over of, as they were at the checkpoint; see
-            `policy_of` for the others.
+        individual: pi_Ind and Q_Ind of the last design that has an episode in the checkpoint; see `policy_of` for the
+            others.
         ensemble: p~; None in a run without one.
         designs: those whose episodes are all over, a row per run and design.
         run: the one that everything else is of; None where all K runs are stacked along the run axis.
