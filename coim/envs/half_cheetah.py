@@ -76,6 +76,7 @@ class HalfCheetahMorph(MorphEnv):
 
     ASSET = "half_cheetah.xml"
     DESIGN_SIZE = 6
+    DESIGN_NAMES = ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot")
     DESIGN_BOUNDS = (0.8, 2.0)
     FRAME_SKIP = 5
     RESET_NOISE = 0.1

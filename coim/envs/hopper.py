@@ -65,6 +65,7 @@ class HopperMorph(MorphEnv):
 
     ASSET = "hopper.xml"
     DESIGN_SIZE = 4
+    DESIGN_NAMES = ("torso", "thigh", "shank", "foot")
     DESIGN_BOUNDS = (0.5, 2.0)
     FRAME_SKIP = 4
     RESET_NOISE = 0.005

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -65,11 +66,13 @@ class MorphEnv(EnvBase):
         num_broken: how often each row's simulation broke so far, ``[K]`` int64.
 
     Raises:
-        ValueError: an argument is out of range, or the device is not there.
+        ValueError: an argument is out of range, the device is not there, or the names of the design's entries do not
+            fit it.
     """
 
     ASSET: ClassVar[str]  # XML file in assets/, or an absolute path
     DESIGN_SIZE: ClassVar[int]
+    DESIGN_NAMES: ClassVar[tuple[str, ...]] = ()  # of the design's entries; see design_names()
     DESIGN_BOUNDS: ClassVar[tuple[float, float]]
     FRAME_SKIP: ClassVar[int]  # simulation steps in an environment step
     RESET_NOISE: ClassVar[float]
@@ -92,6 +95,7 @@ class MorphEnv(EnvBase):
         for name, count in (("num_runs", num_runs), ("episode_steps", episode_steps), ("num_threads", num_threads)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} {count!r} is not a whole number of at least 1")
+        self.design_names()
         speed_along(task, torch.zeros(1))
         self.task, self.episode_steps = task, episode_steps
         self.reset_noise = self.RESET_NOISE if reset_noise is None else reset_noise
@@ -137,6 +141,24 @@ class MorphEnv(EnvBase):
         Returns:
             ``[*B, 1]``.
         """
+
+    @classmethod
+    def design_names(cls) -> tuple[str, ...]:
+        """Names of the D entries of a design, ``DESIGN_NAMES``, or ``design 0, design 1, ...`` of a body without them.
+
+        Raises:
+            ValueError: they are not D different names of letters and digits; words may have spaces between them.
+        """
+        if not cls.DESIGN_NAMES:
+            return tuple(f"design {i}" for i in range(cls.DESIGN_SIZE))
+        names = tuple(cls.DESIGN_NAMES)
+        plain = all(isinstance(name, str) and re.fullmatch(r"[^\W_]+( [^\W_]+)*", name) for name in names)
+        if not plain or len(set(names)) != len(names) or len(names) != cls.DESIGN_SIZE:
+            raise ValueError(
+                f"{cls.__name__}.DESIGN_NAMES is {names}, not {cls.DESIGN_SIZE} different names of letters, digits and "
+                "single spaces, one for each entry of the design; leave it out to count them"
+            )
+        return names
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Reset noise of one row for ``reset_noise=1``: uniform in [-1, 1], positions and velocities, float64."""

@@ -72,6 +72,7 @@ class WalkerMorph(MorphEnv):
 
     ASSET = "walker.xml"
     DESIGN_SIZE = 7
+    DESIGN_NAMES = ("torso", "right thigh", "right knee", "right foot", "left thigh", "left knee", "left foot")
     DESIGN_BOUNDS = (0.5, 2.0)
     FRAME_SKIP = 4
     RESET_NOISE = 0.005

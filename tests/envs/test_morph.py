@@ -373,6 +373,30 @@ def test_a_bad_argument_gets_a_sentence(body, arguments, sentence):
         body(**arguments)
 
 
+@BODIES
+def test_each_entry_of_a_design_has_a_name_from_the_bodys_table(body):
+    names = body.design_names()
+    assert len(names) == body().design_spec.shape[0]
+    assert all(word in body.__doc__ for name in names for word in name.split())
+
+
+def test_without_names_the_entries_are_counted():
+    class Nameless(HopperMorph):
+        DESIGN_NAMES = ()
+
+    Nameless()
+    assert Nameless.design_names() == ("design 0", "design 1", "design 2", "design 3")
+
+
+@pytest.mark.parametrize("names", [("a", "b", "c"), ("a", "b", "c", "c"), ("a", "b", "c", "d,e"), ("a", "b", "c", "")])
+def test_names_that_do_not_fit_the_design_are_refused(names):
+    class Misnamed(HopperMorph):
+        DESIGN_NAMES = names
+
+    with pytest.raises(ValueError, match="Misnamed.DESIGN_NAMES is .* not 4 different names .* leave it out"):
+        Misnamed()
+
+
 @pytest.mark.parametrize(
     ("design", "sentence"),
     [
