@@ -20,6 +20,8 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, RandomSampler, RoundRobinWriter, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
+from coim.randomness import restore_generator
+
 ROW_KEYS: tuple[NestedKey, ...] = (
     "observation",  # [*B, S] f32, s_t without the design
     "design",  # [*B, D] f32, xi
@@ -133,7 +135,7 @@ class TransitionBuffer(TensorDictReplayBuffer):
             self.extend(stored)
         writer["_cursor"] %= self.capacity
         self.writer.load_state_dict(writer)
-        self._rng.set_state(state_dict["generator"].clone())  # torch reads a view of a larger tensor wrongly
+        restore_generator(self._rng, state_dict["generator"])
 
     def check_state(self, state_dict: Mapping[str, Any]) -> None:
         """Refuse a state that does not fit; see :meth:`load_state_dict`."""

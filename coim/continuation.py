@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from coim.events import Kind
+from coim.randomness import restore_generator
 
 if TYPE_CHECKING:
     from coim.coadaptation import CoAdaptation
@@ -99,12 +100,12 @@ def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
     if algorithm.dynamics is not None:
         algorithm.dynamics.load_state_dict(state["dynamics"])
     if algorithm.dream is not None:
-        algorithm.dream.rng.set_state(state["dream"].clone())  # torch reads a view of a larger tensor wrongly
+        restore_generator(algorithm.dream.rng, state["dream"])
     for name in ("env", "evaluation_env"):
         env = getattr(algorithm, name)
         env.set_simulation_state(TensorDict(state[name], state[name]["design"].shape[:1]))
     for name, rng in algorithm.rngs.items():
-        rng.set_state(state["rngs"][name].clone())
+        restore_generator(rng, state["rngs"][name])
     if state["search"] is not None:
         _if_any(algorithm.search, "load_state_dict", state["search"])
     algorithm.buffers.load_state_dict(state["buffers"])

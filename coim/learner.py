@@ -31,6 +31,7 @@ from coim.objectives.functional import mixing_weights
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
 from coim.objectives.runs import check_batch
 from coim.objectives.sac import CoImSACLoss
+from coim.randomness import restore_generator
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -136,7 +137,7 @@ class SACLearner:
         for name, tensor in own.items():
             tensor.copy_(state_dict[name])
         load_moments(self.optimiser, self._weights, state_dict["moments"])
-        self.rng.set_state(state_dict["rng"].clone())  # torch reads a view of a larger tensor wrongly
+        restore_generator(self.rng, state_dict["rng"])
 
     def weights_by_run(self) -> list[Tensor]:
         """Weights and targets, each with the run axis first, ``[K, ...]``: views, not copies."""

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded
 
+from coim.randomness import restore_generator
+
 from .bounds import bounds_of
 from .search import Fitness, evaluate
 
@@ -101,7 +103,7 @@ class GradientSearch:
 
     def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
         """Go on with the random numbers of :meth:`state_dict`."""
-        self._rng.set_state(state_dict["rng"].clone())  # torch reads a view of a larger tensor wrongly
+        restore_generator(self._rng, state_dict["rng"])
 
 
 def _with_gradient(fitness: Fitness, designs: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,6 +29,7 @@ from torchrl.envs import EnvBase
 from coim.envs.camera import Camera
 from coim.envs.simulation import PITCH, ROOT_X, Simulations
 from coim.envs.task import Task, speed_along
+from coim.randomness import restore_generator
 
 DONE_KEYS = ("done", "terminated", "truncated")
 
@@ -293,7 +294,7 @@ class MorphEnv(EnvBase):
         self._build(state["design"], np.arange(self.numel()))
         self.simulations.state[:] = state["simulation"].numpy()
         for generator, generator_state in zip(self._generators, state["generator"]):
-            generator.set_state(generator_state.clone())  # torch reads a view of a larger tensor wrongly
+            restore_generator(generator, generator_state)
         self._observation, self._step_count, self.num_broken = (
             state[key] for key in ("observation", "step_count", "num_broken")
         )

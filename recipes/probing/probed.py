@@ -28,6 +28,7 @@ from coim import (
     sample_mixture,
 )
 from coim.coadaptation import UPDATES_PER_SAMPLE
+from coim.randomness import restore_generator
 from recipes.probing.errors import change_variance, mean_squares, persistence_error, prediction_error
 from recipes.probing.probes import Probes, joined
 from recipes.results import Table
@@ -138,7 +139,7 @@ class ProbedCoAdaptation:
             raise ValueError(f"the run was measured with {probed['asked']}, not with {self._asked()}; leave them")
         self.algorithm.load_state_dict(state_dict)
         self.other.load_state_dict(probed["other"])
-        self._rng.set_state(probed["rng"].clone())
+        restore_generator(self._rng, probed["rng"])
         runs = self.algorithm.env.numel()
         self.seen = [TensorDict(rows, [len(rows["design"]), runs]).unflatten_keys(".") for rows in probed["seen"]]
         self._table = Table(self.path, COLUMNS, keep=probed["csv_rows"])

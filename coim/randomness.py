@@ -1,0 +1,37 @@
+"""States of random number generators, given back to generators of this or another kind of device.
+
+References:
+    PyTorch: `torch.Generator <https://docs.pytorch.org/docs/stable/generated/torch.Generator.html>`_.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import torch
+from torch import Tensor
+
+
+def restore_generator(generator: torch.Generator, state: Tensor) -> None:
+    """Let a generator go on from a saved state.
+
+    A state belongs to a kind of device: that of a CPU's generator is 5056 bytes, that of a GPU's 16. A generator of the
+    kind that was saved goes on with the same numbers. One of another kind cannot, and is seeded by the saved bytes: its
+    numbers are others, and the same ones each time that this state is restored.
+
+    Args:
+        generator: is changed in place.
+        state: ``[bytes]`` uint8 of `torch.Generator.get_state`, on any device.
+
+    Example:
+        >>> saved, other = torch.Generator().manual_seed(0), torch.Generator()
+        >>> restore_generator(other, saved.get_state())
+        >>> torch.equal(torch.rand(3, generator=saved), torch.rand(3, generator=other))
+        True
+    """
+    own = state.detach().cpu().clone()  # torch reads a view of a larger tensor wrongly
+    if own.shape == generator.get_state().shape:
+        generator.set_state(own)
+    else:
+        digest = hashlib.sha256(own.numpy().tobytes()).digest()
+        generator.manual_seed(int.from_bytes(digest[:8], "big") >> 1)  # seeds are 63 bits and a sign
