@@ -13,6 +13,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
+from coim.products import Choice, chosen
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -29,7 +31,8 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
 
     Returns:
         A function with the same results up to rounding. It may be called by several threads; whoever calls first
-        compiles, the others wait. Later calls must have the shapes and dtypes of the first.
+        compiles, the others wait. Later calls must have the shapes and dtypes of the first. Where `coim.products.use`
+        has chosen other products since, it is compiled anew, once for each choice.
 
     Raises:
         RuntimeError: by the returned function, if a call has other shapes; torch names the tensor.
@@ -49,14 +52,15 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
         tensor([0., 0.])
     """
     slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options={"cpp_wrapper": device.type == "cpu"})
-    quick: list[Callable[P, R]] = []
+    quick: dict[Choice, Callable[P, R]] = {}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not quick:
+        products = chosen()
+        if products not in quick:
             with _COMPILING:
-                if not quick:
-                    quick.append(slow.aot_compile((args, kwargs)))
-        return quick[0](*args, **kwargs)
+                if products not in quick:
+                    quick[products] = slow.aot_compile((args, kwargs))
+        return quick[products](*args, **kwargs)
 
     return call

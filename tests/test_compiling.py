@@ -7,8 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
+from coim import products
 from coim.compiling import compiled
-from coim.products import affine, input_gradient, weight_gradient
+from coim.products import Choice, affine, input_gradient, weight_gradient
 
 
 def layer(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> list[torch.Tensor]:
@@ -33,6 +34,39 @@ def test_other_shapes_are_refused_instead_of_compiled_or_taken_uncompiled() -> N
     without_gradients(quick, torch.randn(8, 4), weight, bias)
     with pytest.raises(RuntimeError, match="expected 8, actual 9"):
         without_gradients(quick, torch.randn(9, 4), weight, bias)
+
+
+def test_compiled_code_follows_the_choice_of_products() -> None:
+    x, weight, bias = (torch.randn(*shape).bfloat16() for shape in ((40, 23), (23, 12), (12,)))
+    quick, before = compiled(affine, x.device), products.chosen()
+    choices = [Choice("torch", "emulated"), products.use("onednn")]
+    try:
+        for choice in choices * 2:
+            products.use(choice)
+            value, right = (without_gradients(function, x, weight, bias) for function in (quick, affine))
+            torch.testing.assert_close(value, right, rtol=0.02, atol=0.02)
+    finally:
+        products.use(before)
+
+
+def test_it_is_compiled_once_for_each_choice_of_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Choice] = []
+
+    class Slow:
+        def aot_compile(self, inputs: object) -> object:
+            made.append(products.chosen())
+            return lambda choice=made[-1]: choice
+
+    monkeypatch.setattr("torch.compile", lambda function, **options: Slow())
+    quick, before = compiled(lambda: None, torch.device("cpu")), products.chosen()
+    choices = [Choice("torch", "emulated"), products.use("onednn")]
+    try:
+        for choice in choices * 2:
+            products.use(choice)
+            assert quick() == choice
+    finally:
+        products.use(before)
+    assert made == choices
 
 
 def without_gradients(function: object, *args: torch.Tensor) -> list[torch.Tensor]:

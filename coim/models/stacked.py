@@ -20,11 +20,11 @@ from typing import TypeVar, cast
 import torch
 from torch import Tensor, nn
 
-from coim.products import Activation, affine
+from coim.products import Activation, affine, emulated
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
-# Without gradients: with fewer rows the set-up of oneDNN costs more than its products gain, with more the activations
+# Without gradients: with fewer rows the set-up of each product costs more than it gains, with more the activations
 # leave the cache of a CPU core.
 FEW_ROWS, CHUNK_ROWS = 128, 2_000
 FUSED: dict[type[nn.Module], Activation] = {nn.ReLU: "relu", nn.SiLU: "swish"}
@@ -67,10 +67,15 @@ class StackedLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer: ``[R, F] -> [R, O]`` without a stack, ``[G, R, F] -> [G, R, O]`` with one."""
-        if self.weight.dim() == 2:
-            return torch.addmm(self.bias, x, self.weight)
-        weight, bias = self.weight.flatten(0, -3), self.bias.flatten(0, -2)
-        return torch.baddbmm(bias.unsqueeze(1), x, weight)
+        if emulated(x):
+            return self._product(x.float(), self.weight.float(), self.bias.float()).to(x.dtype)
+        return self._product(x, self.weight, self.bias)
+
+    @staticmethod
+    def _product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        if weight.dim() == 2:
+            return torch.addmm(bias, x, weight)
+        return torch.baddbmm(bias.flatten(0, -2).unsqueeze(1), x, weight.flatten(0, -3))
 
 
 class StackedMLP(nn.Module):
