@@ -393,7 +393,7 @@ def test_names_that_do_not_fit_the_design_are_refused(names):
     class Misnamed(HopperMorph):
         DESIGN_NAMES = names
 
-    with pytest.raises(ValueError, match="Misnamed.DESIGN_NAMES is .* not 4 different names .* leave it out"):
+    with pytest.raises(ValueError, match=r"Misnamed.DESIGN_NAMES is .* not 4 different names .* leave it out"):
         Misnamed()
 
 
