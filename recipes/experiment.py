@@ -107,7 +107,8 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
     checkpoints = Checkpoints(folder, algorithm, best)
     notes = checkpoints.load() if settings.resume is not None else None
     trial = algorithm.trial
-    results = Results(folder, name, settings, algorithm.env.design_spec.shape[0], notes=notes)
+    names = type(algorithm.env).design_names()
+    results = Results(folder, name, settings, names, notes=notes)
     progress = Progress(
         num_designs=settings.num_designs,
         total_episodes=sum(episodes_of_designs(type(algorithm.env), settings)),
@@ -117,7 +118,7 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         best=None if trial is None else trial.best,
         quiet=settings.quiet,
     )
-    log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb, quiet=settings.quiet)
+    log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb, names, quiet=settings.quiet)
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)

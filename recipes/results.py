@@ -21,6 +21,7 @@ from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
 from recipes.writing import shortest, write_whole
 
+DESIGN_PREFIX = "xi_"  # of the columns that hold a design
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
 
 
@@ -36,7 +37,7 @@ class Results:
         environment: name of the body, for ``config.json``.
         settings: of the run, for ``config.json``. With ``settings.resume`` the folder is gone on with: rows that came
             after the checkpoint are dropped, they will come again.
-        design_size: D.
+        design_names: of the D entries of a design.
         notes: the `notes` of the checkpoint that is gone on from; without them the files start anew.
 
     Raises:
@@ -49,7 +50,7 @@ class Results:
         folder: Path,
         environment: str,
         settings: Settings,
-        design_size: int,
+        design_names: Sequence[str],
         *,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
@@ -63,7 +64,7 @@ class Results:
             write_whole(folder / "config.json", json.dumps(describe(environment, settings), indent=2) + "\n")
         else:
             note_resumption(folder, settings)
-        xi = [f"xi_{i + 1}" for i in range(design_size)]
+        xi = design_columns(design_names)
         self._evaluations = Table(
             folder / "evaluations.csv",
             [
@@ -160,7 +161,10 @@ class Results:
     def table(self) -> str:
         """The designs and their best returns, for a terminal."""
         with self._designs.path.open(newline="") as file:
-            return "\n".join(format_row(row) for row in csv.reader(file))
+            columns, *rows = csv.reader(file)
+        lines = [[entry_of_column(name) or name for name in columns], *(format_row(row) for row in rows)]
+        widths = [max(map(len, cells)) for cells in zip(*lines)]
+        return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines)
 
 
 def where_diverged(event: DesignChosen | EpisodeDone | DesignDone, run: int) -> str | None:
@@ -171,13 +175,43 @@ def where_diverged(event: DesignChosen | EpisodeDone | DesignDone, run: int) -> 
     return f"design {index + 1}, episode {episode + 1}"
 
 
+def design_columns(names: Sequence[str]) -> list[str]:
+    """Columns of a design in a CSV file; readers know them by how they begin, in older folders by ``xi_1, xi_2, ...``.
+
+    Example:
+        >>> design_columns(["torso", "right thigh"])
+        ['xi_torso', 'xi_right_thigh']
+    """
+    return [f"{DESIGN_PREFIX}{name.replace(' ', '_')}" for name in names]
+
+
+def entry_of_column(column: str) -> str | None:
+    """The name of an entry of the design from its column; None of other columns, and where older folders count.
+
+    Example:
+        >>> entry_of_column("xi_right_thigh"), entry_of_column("xi_2"), entry_of_column("run")
+        ('right thigh', None, None)
+    """
+    entry = column.removeprefix(DESIGN_PREFIX)
+    return None if entry == column or entry.isdigit() else entry.replace("_", " ")
+
+
+def same_columns(found: Sequence[str], wanted: Sequence[str]) -> bool:
+    """Whether two headers hold the same, whatever the entries of the design are called."""
+    return len(found) == len(wanted) and all(
+        one == other or (one.startswith(DESIGN_PREFIX) and other.startswith(DESIGN_PREFIX))
+        for one, other in zip(found, wanted)
+    )
+
+
 class Table:
     """A CSV file that grows; every append is on disk before the next line of the program.
 
     Args:
         path: of the file.
         columns: their names.
-        keep: rows of an existing file that stay; None begins a new one.
+        keep: rows of an existing file that stay, and its header, in which the design's entries may have other names (in
+            older folders they are counted); None begins a new one.
 
     Raises:
         ValueError: if the existing file has fewer rows, or other columns.
@@ -190,7 +224,7 @@ class Table:
             return
         with path.open(newline="") as file:
             lines = file.read().splitlines()
-        if lines[:1] != [",".join(columns)]:
+        if not lines or not same_columns(lines[0].split(","), columns):
             raise ValueError(f"{path} has other columns than {columns}; go on with the version in config.json")
         if len(lines) <= keep:
             raise ValueError(f"{path} has {len(lines) - 1} rows, the checkpoint was made after {keep}; put them back")
@@ -205,15 +239,15 @@ class Table:
         self.num_rows += len(cells)
 
 
-def format_row(row: Sequence[str]) -> str:
-    """Cells of one width; numbers with four significant digits."""
+def format_row(row: Sequence[str]) -> list[str]:
+    """Cells for a terminal: numbers with four significant digits, a dash for what is not known."""
     cells = []
     for cell in row:
         try:
             cells.append(cell if cell.isdigit() else f"{float(cell):.4g}")
         except ValueError:
             cells.append(cell or "-")
-    return "  ".join(cell.rjust(9) for cell in cells)
+    return cells
 
 
 def _cell(value: Any) -> Any:

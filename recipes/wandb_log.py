@@ -6,7 +6,7 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
@@ -15,6 +15,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from coim import EpisodeDone, Event
 from coim.events import running
+from recipes.results import design_columns
 from recipes.settings import read_config
 
 PATIENCE = 60  # s that the end of a run waits for what W&B still has to write or send
@@ -32,13 +33,21 @@ class WandbLog:
         folder: of the run.
         environment: name of the body, for the project.
         mode: online needs an account and a network, offline neither.
+        design_names: of the entries of a design.
         quiet: whether W&B says nothing of its own on the terminal.
     """
 
     def __init__(
-        self, folder: Path, environment: str, mode: Literal["offline", "online"], *, quiet: bool = False
+        self,
+        folder: Path,
+        environment: str,
+        mode: Literal["offline", "online"],
+        design_names: Sequence[str],
+        *,
+        quiet: bool = False,
     ) -> None:
         self._folder, self._environment, self._quiet = folder, environment, quiet
+        self._design_columns = design_columns(design_names)
         try:
             logger = self._open(offline=mode == "offline")
         except Exception as error:  # W&B's own kinds have no common name
@@ -79,7 +88,7 @@ class WandbLog:
     def _work(self, logger: WandbLogger) -> None:
         try:
             while (event := self._waiting.get()) is not None:
-                for name, value in scalars(event).items():
+                for name, value in scalars(event, self._design_columns).items():
                     logger.log_scalar(name, value, step=event.env_steps)
                 for run, (index, episode) in event.diverged.items():
                     logger.experiment.summary[f"run {run}/diverged"] = f"design {index + 1}, episode {episode + 1}"
@@ -92,14 +101,14 @@ class WandbLog:
                 wandb.teardown()  # or it would tell of its death once more, when the process ends
 
 
-def scalars(event: EpisodeDone) -> dict[str, float]:
-    """The numbers of the CSV files, one series for each run, over training steps."""
+def scalars(event: EpisodeDone, design_columns: Sequence[str]) -> dict[str, float]:
+    """The numbers of the CSV files under the names of their columns, one series for each run, over training steps."""
     found = {f"seconds/{part}": value for part, value in event.seconds.items()}
     for run in running(event):
         found[f"run {run}/return"] = float(event.evaluation_return[run])
         found[f"run {run}/training return"] = float(event.training_return[run])
         found |= {f"run {run}/{key}": float(values[run]) for key, values in event.metrics.items()}
-        found |= {f"run {run}/xi_{i + 1}": float(xi) for i, xi in enumerate(event.design[run])}
+        found |= {f"run {run}/{name}": float(xi) for name, xi in zip(design_columns, event.design[run])}
     return found
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from recipes.probing.errors import Model
 from recipes.probing.truth import PlacedSimulator
+from recipes.results import design_columns
 
 SIDE = 41  # points along each of the two directions
 AREA = 0.05  # of the square that two entries of a design span: of less, a picture shows next to nothing
@@ -164,6 +165,7 @@ def design_space(
         ValueError: if there are too few designs for two components.
     """
     directions, shares = principal_directions(tried)
+    names = design_columns(type(simulator.env).design_names())
     found: list[dict[str, object]] = []
     for state, row in enumerate(rows.unbind(0)):
         origin = row["design"]
@@ -173,7 +175,7 @@ def design_space(
         designs = torch.cat([origin + grid @ directions, tried])
         changes = {name: predicted_change(model, row, designs) for name, model in models.items()}
         changes["simulator"], depth = true_change(simulator, next(iter(models.values())), row, designs)
-        columns: dict[str, list[float]] = {f"xi_{i + 1}": xi.tolist() for i, xi in enumerate(designs.unbind(1))}
+        columns = {name: xi.tolist() for name, xi in zip(names, designs.unbind(1))}
         for name, change in changes.items():
             columns[f"change/{name}"] = change.square().sum(-1).tolist()
             columns[f"normalised/{name}"] = (change.square() / variance).mean(-1).tolist()

@@ -16,6 +16,7 @@ from recipes.parts import episodes_of_designs, make_buffers
 from recipes.reporting.palette import KINDS
 from recipes.settings import PRESETS, Settings, parse
 
+XI = ["xi_torso", "xi_thigh", "xi_shank", "xi_foot"]
 TINY = ["--num-designs", "7", "--first-episodes", "1", "--episodes", "1", "--episode-steps", "6", "--num-cells", "8"]
 TINY += ["--individual-updates", "2", "--population-updates", "2", "--model-updates", "2", "--model-cells", "8"]
 TINY += ["--batch-size", "10", "--num-particles", "4", "--num-iterations", "2", "--num-start-states", "3"]
@@ -39,8 +40,9 @@ def test_a_run_leaves_its_settings_its_numbers_and_a_picture(tmp_path: Path, cap
     assert config["versions"].keys() >= {"coim", "torch", "torchrl", "mujoco", "python"}
     assert [row["kind"] for row in designs] == ["first"] * 5 + ["optimised", "random"]
     assert [int(row["design"]) for row in evaluations] == list(range(1, 8))
+    assert [name for name in evaluations[0] if name.startswith("xi_")] == XI
     for row, design in zip(evaluations, designs, strict=True):
-        assert [row[f"xi_{i}"] for i in range(1, 5)] == [design[f"xi_{i}"] for i in range(1, 5)]
+        assert [row[name] for name in XI] == [design[name] for name in XI]
         assert row["return"] == design["best_return"]  # one evaluation each
     assert int(evaluations[-1]["env_steps"]) == 7 * 6
     assert (tmp_path / "run" / "figures" / "designs.png").stat().st_size > 10_000
@@ -85,14 +87,14 @@ def test_the_baseline_differs_from_the_method_by_imagination_alone(tmp_path: Pat
     assert ours[1]["return"] != theirs[1]["return"]
     for ours_too, theirs_too in zip(ours, theirs, strict=True):
         if ours_too["kind"] != "optimised":
-            assert [ours_too[f"xi_{i}"] for i in range(1, 5)] == [theirs_too[f"xi_{i}"] for i in range(1, 5)]
+            assert [ours_too[name] for name in XI] == [theirs_too[name] for name in XI]
 
 
 def test_runs_in_lock_step_have_a_row_each(tmp_path: Path) -> None:
     run(tmp_path / "fleet", "--num-runs", "3", "--designs", "noisy", "--task", "backward", "--quiet")
     designs = read(tmp_path / "fleet" / "designs.csv")
     assert [row["run"] for row in designs] == ["0", "1", "2"] * 7
-    assert len({row["xi_1"] for row in designs if row["kind"] == "random"}) == 3
+    assert len({row["xi_torso"] for row in designs if row["kind"] == "random"}) == 3
 
 
 def test_the_baseline_imagines_nothing_and_quiet_is_quiet(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -183,7 +185,7 @@ def test_a_fixed_body_is_marked_as_such(tmp_path: Path) -> None:
     run(tmp_path / "fixed", "--designs", "none", "--bodies", "fixed", "--quiet")
     designs = read(tmp_path / "fixed" / "designs.csv")
     assert [row["kind"] for row in designs] == ["fixed"] * 7
-    assert all(float(row[f"xi_{i}"]) == 1 for row in designs for i in range(1, 5))
+    assert all(float(row[name]) == 1 for row in designs for name in XI)
     assert len({KINDS[kind] for kind in get_args(Kind)}) == len(KINDS)  # pictures tell every kind apart
 
 
@@ -207,4 +209,4 @@ def test_a_run_can_begin_with_one_body_of_its_own(tmp_path: Path) -> None:
     run(tmp_path, "--first-design", "0.8", "1.2", "1", "1.5", "--num-designs", "2", "--first-episodes", "2", "--quiet")
     rows = read(tmp_path / "evaluations.csv")
     assert [row["kind"] for row in rows] == ["first", "first", "optimised"]
-    assert [float(rows[0][f"xi_{i}"]) for i in range(1, 5)] == [0.8, 1.2, 1, 1.5]
+    assert [float(rows[0][name]) for name in XI] == [0.8, 1.2, 1, 1.5]

@@ -167,7 +167,7 @@ def test_a_run_of_a_fleet_that_diverges_is_measured_no_more_and_is_not_drawn(
     assert {(row["design"], row["episode"]) for row in rows if row["run"] == "0"} == {("1", "1")}
     assert {row["design"] for row in rows if row["run"] == "1"} == {"1", "2", "3"}
     write_design_space(measured, HopperMorph, tmp_path)
-    drawn = {row["xi_1"] for row in read(tmp_path / "design_space.csv") if row["point"] == "tried"}
+    drawn = {row["xi_torso"] for row in read(tmp_path / "design_space.csv") if row["point"] == "tried"}
     own = [rows["design"][0, 1, 0].item() for rows in measured.seen]
     assert sorted(map(float, drawn)) == pytest.approx(sorted(own), rel=1e-6)
     measured.divergence.places[1] = (2, 1)

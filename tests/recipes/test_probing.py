@@ -209,7 +209,9 @@ def test_the_own_design_changes_nothing_and_the_simulator_agrees_with_itself(row
     directions, _ = principal_directions(tried)
     for point in grid[:3]:
         design = rows[0, 1]["design"] + torch.tensor([point["pc_1"], point["pc_2"]]) @ directions
-        assert [point[f"xi_{i}"] for i in range(1, 5)] == pytest.approx(design.tolist(), abs=1e-6)
+        assert [point[f"xi_{name}"] for name in ("torso", "thigh", "shank", "foot")] == pytest.approx(
+            design.tolist(), abs=1e-6
+        )
         state, own = rows[0, 1], rows[0, 1]["design"]
         change = by_hand(state["observation"], state["action"], design)
         change = change - by_hand(state["observation"], state["action"], own)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import pytest
 import torch
 
-from coim import EpisodeDone
-from recipes.results import Results
+from coim import DesignChosen, DesignDone, EpisodeDone, HopperMorph, WalkerMorph
+from recipes.results import Results, Table
 from recipes.settings import Settings
 
 
 def test_seconds_stand_under_their_part_whichever_learner_ends_first(tmp_path: Path) -> None:
-    results = Results(tmp_path / "run", "hopper", Settings(), design_size=4)
+    results = Results(tmp_path / "run", "hopper", Settings(), design_names=HopperMorph.design_names())
     for episode, parts in enumerate(
         (("train individual", "train population"), ("train population", "train individual"))
     ):
@@ -35,3 +36,27 @@ def test_seconds_stand_under_their_part_whichever_learner_ends_first(tmp_path: P
         rows = list(csv.DictReader(file))
     assert [row["seconds/train individual"] for row in rows] == ["1", "1"]
     assert [row["seconds/train population"] for row in rows] == ["2", "2"]
+
+
+def test_the_table_on_the_terminal_has_the_names_of_the_body_above_its_numbers(tmp_path: Path) -> None:
+    results = Results(tmp_path / "run", "walker", Settings(), design_names=WalkerMorph.design_names())
+    design = torch.tensor([[1.0, 1.5, 1.0, 1.0, 1.0, 0.75, 1.0]])
+    results.write(DesignChosen(0, "first", design, None), 1.0)
+    results.write(DesignDone(0, "first", design, torch.tensor([123.456])), 2.0)
+    head, row = results.table().splitlines()
+    for name, value in (("torso", "1"), ("right thigh", "1.5"), ("left knee", "0.75"), ("best_return", "123.5")):
+        end = head.index(name) + len(name)
+        assert row[:end].split()[-1] == value
+
+
+def test_a_file_whose_design_columns_are_counted_grows_on_under_its_own_header(tmp_path: Path) -> None:
+    path = tmp_path / "designs.csv"
+    path.write_text("run,xi_1,xi_2,best_return\n0,1,1,5\n0,2,2,6\n")
+    Table(path, ["run", "xi_torso", "xi_foot", "best_return"], keep=1).append([[0, 3.0, 3.0, 7.0]])
+    assert path.read_text() == "run,xi_1,xi_2,best_return\n0,1,1,5\n0,3,3,7\n"
+    for others in (
+        ["run", "xi_torso", "xi_thigh", "xi_foot", "best_return"],
+        ["run", "xi_torso", "foot", "best_return"],
+    ):
+        with pytest.raises(ValueError, match="has other columns"):
+            Table(path, others, keep=1)

@@ -16,12 +16,13 @@ import pytest
 import torch
 from interrupted_runs import cut, resume, run
 
-from coim import HopperMorph
+from coim import HopperMorph, load_run
 from recipes import model_error, soak
 from recipes.checkpoint import Checkpoints
 from recipes.experiment import main
 from recipes.interrupt import Stopped, end_soon, locked, stopping_at_once
 from recipes.replay_file import ReplayFile
+from recipes.reporting.records import read_rows
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +71,22 @@ def test_settings_of_another_version_are_named(tmp_path: Path) -> None:
     config.write_text(config.read_text().replace('"gamma"', '"discount"'))
     with pytest.raises(SystemExit, match="other settings: discount, gamma"):
         resume(folder)
+
+
+def test_a_run_whose_files_count_the_entries_of_a_design_goes_on_and_is_read(whole: Path, tmp_path: Path) -> None:
+    folder = cut(tmp_path / "older", 9)
+    for name in ("evaluations.csv", "designs.csv"):
+        text = (folder / name).read_text()
+        for i, entry in enumerate(("torso", "thigh", "shank", "foot")):
+            text = text.replace(f"xi_{entry}", f"xi_{i + 1}", 1)
+        (folder / name).write_text(text)
+    resume(folder)
+    assert (folder / "designs.csv").read_text().splitlines()[1:] == (whole / "designs.csv").read_text().splitlines()[1:]
+    for older, newer in zip(load_run(folder).designs, load_run(whole).designs, strict=True):
+        assert older.design.tolist() == newer.design.tolist()
+    assert [row["xi"] for row in read_rows(folder / "designs.csv")] == [
+        row["xi"] for row in read_rows(whole / "designs.csv")
+    ]
 
 
 def test_other_packages_are_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

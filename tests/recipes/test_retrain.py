@@ -12,11 +12,13 @@ from coim import HopperMorph
 from recipes import experiment
 from recipes.figures import write_figures
 from recipes.plots.runs import read_runs
+from recipes.results import design_columns
 from recipes.retrain import Retrain, best_designs, cell_of, choose, episodes_in_words, main
 from recipes.settings import Settings, parse, plain
 from tests.recipes.made_up_study import read_table, write_cell
 from tests.recipes.test_experiment import TINY
 
+XI = design_columns(HopperMorph.design_names())
 PLACE = ("hopper", "forward")
 
 
@@ -151,7 +153,7 @@ def test_designs_are_retrained_once_and_drawn(
         episodes = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
         assert [row["kind"] for row in episodes] == ["first", "first"]
         assert [row["episode"] for row in episodes] == ["1", "2"]
-        assert all(row[f"xi_{i}"] == found[f"xi_{i}"] for row in episodes for i in range(1, 5))
+        assert all(row[name] == found[name] for row in episodes for name in XI)
     main([str(tmp_path), "--episodes", "2", "--workers", "1"])
     assert "0 of 2 designs to train" in capsys.readouterr().out
     with pytest.raises(SystemExit, match=r"made with other settings: first_episodes \(2 to 3\)"):
