@@ -23,6 +23,14 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coim.agreement import (
+    check_bodies,
+    check_counts,
+    check_dream,
+    check_first_designs,
+    check_learners,
+    check_precision,
+)
 from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
 from coim.continuation import Trial, restore, state_of
@@ -59,9 +67,10 @@ class CoAdaptation:
         evaluation_env: bodies of its own for the evaluation episodes, so that evaluating changes nothing in training.
         population: learner that sees all designs.
         individual: learner that sees the current design; starts each design from the population's weights.
-        buffers: Replay_Pop, Replay_Ind, Replay_s0 and Replay_Art.
+        buffers: Replay_Pop, Replay_Ind, Replay_s0 and Replay_Art. They may live on the CPU while the learners are on a
+            GPU: batches are moved, all of one call at once.
         search: maximises Eq. 5 over the design space.
-        first_designs: ``[I, D]`` bodies that every run tries first.
+        first_designs: ``[I, D]`` bodies that every run tries first, on the device of the bodies.
         bodies: which come after them: ``"search"`` is Algorithm 1 (the optimum of Eq. 5 and a random one in turn),
             ``"random"`` never searches. ``"fixed"`` takes the first of the first designs every time, from the start on:
             the same budget for one body.
@@ -82,13 +91,17 @@ class CoAdaptation:
             individual networks too, Sec. 5 gives imagined rows to the population alone; 0 follows Sec. 5.
         num_start_states: n, start states that Eq. 5 averages over.
         side_by_side: train the individual learner in one thread while another trains the population's and the ensemble.
-            They do not depend on each other, and the result is the same to the last bit.
+            They do not depend on each other, and the result is the same to the last bit. For learners on the CPU.
         precision: of the networks' products in Eq. 5; each learner has its own.
-        seed: seeds the generators of the actions, the imagination and the random designs.
+        seed: seeds the generators of the actions, the imagination and the random designs. Actions and random designs
+            are drawn on the CPU wherever the networks are: there the same seed gives the same first episode.
 
     Raises:
-        ValueError: if a count is below its least value, a share outside [0, 1] or of less than a row, first designs
-            have the wrong shape, ``bodies`` is unknown, or only one of ``dream`` and ``generator`` is given.
+        ValueError: if a count is below its least value, a share outside [0, 1] or of less than a row, ``bodies`` or
+            ``precision`` is unknown, or the parts do not agree (see `coim.agreement`): two environments or learners
+            are one, evaluation is of another body or task, networks lack the runs of the bodies, the dream steps
+            another ensemble than the one that learns or pays other rewards, G leaves the bounds, first designs have
+            the wrong shape, dtype or device, or learners that are not on the CPU shall go side by side.
 
     Note:
         Whoever stops at an event may come back to it: iterating again goes on with what comes next, and so does another
@@ -127,8 +140,6 @@ class CoAdaptation:
         precision: Literal["float32", "bfloat16"] = "float32",
         seed: int = 0,
     ) -> None:
-        if (dream is None) != (generator is None):
-            raise ValueError("imagining needs both a dream and a generator; give both, or neither for the baseline")
         if bodies not in ("search", "random", "fixed"):
             raise ValueError(f"bodies={bodies!r} is unknown; choose 'search', 'random' or 'fixed'")
         counts = {
@@ -138,20 +149,13 @@ class CoAdaptation:
             "batch_size": batch_size,
             "num_start_states": num_start_states,
         }
-        for name, count in counts.items():
-            if count < 1:
-                raise ValueError(f"{name} is {count}, it must be at least 1")
         updates = {"individual": individual_updates, "population": population_updates, "model": model_updates}
-        for name, count in updates.items():
-            if count < 0:
-                raise ValueError(f"{name}_updates is {count}, it must be at least 0 (0 does not train)")
-        if first_designs.ndim != 2 or first_designs.shape[1:] != env.design_spec.shape:
-            raise ValueError(
-                f"first_designs has shape {list(first_designs.shape)}, expected [I, {env.design_spec.shape[0]}]"
-            )
-        low, high = env.design_spec.space.low, env.design_spec.space.high
-        if not ((low <= first_designs) & (first_designs <= high)).all():
-            raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")
+        check_counts(counts, {f"{name}_updates": count for name, count in updates.items()})
+        check_precision(precision)
+        check_bodies(env, evaluation_env)
+        check_first_designs(env, first_designs)
+        self.device = check_learners(env, population, individual, dynamics, side_by_side=side_by_side)
+        check_dream(env, dynamics, dream, generator, first_designs)
         self.env, self.evaluation_env = env, evaluation_env
         self.population, self.individual, self.dynamics = population, individual, dynamics
         self.divergence = Divergence(
@@ -170,12 +174,7 @@ class CoAdaptation:
         self.imagined_rows = self._rows_to_draw()
         self.index, self.env_steps = 0, 0
         self.trial: Trial | None = None  # the body that is being tried
-        seeds = torch.Generator().manual_seed(seed)
-        # One generator for each reader and writer, so that nothing depends on who comes first.
-        self.rngs = {
-            name: torch.Generator(env.device or "cpu").manual_seed(int(torch.randint(2**62, (), generator=seeds)))
-            for name in ("actions", "dream", "designs", "individual", "population", "model")
-        }
+        self.rngs = self._generators(seed)
         self.precision = precision
         self._beside = ThreadPoolExecutor(1, "coim-population") if side_by_side else None
         self._abandoned = threading.Event()
@@ -218,6 +217,19 @@ class CoAdaptation:
         model = 0 if self.dynamics is None else self.model_updates
         return self.individual_updates + self.population_updates + model
 
+    def _generators(self, seed: int) -> dict[str, torch.Generator]:
+        """One for each reader and writer, so that nothing depends on who comes first; each where its numbers are."""
+        seeds = torch.Generator().manual_seed(seed)
+        replay = self.buffers.pop.storage.device
+        # The bodies move on the CPU: what they get is drawn there, and is the same wherever the networks are.
+        cpu = torch.device("cpu")
+        devices: dict[str, torch.device] = {"actions": cpu, "dream": self.device, "designs": cpu}
+        devices |= dict.fromkeys(("individual", "population", "model"), replay)
+        return {
+            name: torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=seeds)))
+            for name, device in devices.items()
+        }
+
     def _episodes_of(self, index: int) -> int:
         return self.first_episodes if index < len(self.first_designs) else self.episodes
 
@@ -228,13 +240,14 @@ class CoAdaptation:
             # Collect experience for the current design with pi_Ind.
             with booked(seconds, "collect"):
                 rows = run_episode(self.env, self.individual.policy, design=design, rng=self.rngs["actions"])
-                self.buffers.ind.extend(rows)
-                self.buffers.pop.extend(rows)
+                stored = self._to_replay(rows)
+                self.buffers.ind.extend(stored)
+                self.buffers.pop.extend(stored)
             # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
             with booked(seconds, "imagine"):
                 metrics = self._observe(rows)
                 self._refresh_imagined()
-            self.buffers.s0.extend(rows[:1])
+            self.buffers.s0.extend(stored[:1])
             self.divergence.remember()
             metrics |= self._learn(seconds)
             self.divergence.contain(metrics, place)
@@ -262,17 +275,22 @@ class CoAdaptation:
         """Scale the ensemble by the new rows, and say how well it foresaw them before it learns from them."""
         if self.dynamics is None:
             return {}
-        self.dynamics.observe(rows)
-        return {"model_error": self.dynamics.error(rows).cpu()}
+        seen = rows.to(self.device)
+        self.dynamics.observe(seen)
+        return {"model_error": self.dynamics.error(seen).cpu()}
 
     def _refresh_imagined(self) -> None:
         """Empty Replay_Art and fill it with states of Replay_Pop, designs of G, and actions of pi_Pop."""
         self.buffers.art.empty()
         if self.dream is None or self.generator is None or len(self.buffers.pop) == 0:
             return
-        states = self.buffers.pop.sample(self.imagined_rows)
+        states = self.buffers.pop.sample(self.imagined_rows).to(self.device)
         rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self.rngs["dream"])
-        self.buffers.art.extend(rows)
+        self.buffers.art.extend(self._to_replay(rows))
+
+    def _to_replay(self, rows: TensorDictBase) -> TensorDictBase:
+        """Rows where the buffers are."""
+        return rows.to(self.buffers.pop.storage.device)
 
     def _rows_to_draw(self) -> int:
         """Imagined rows that the updates after one episode will draw, and at least one."""
@@ -319,7 +337,7 @@ class CoAdaptation:
                     raise RuntimeError("an update failed or was interrupted; go on from a state_dict of before")
                 count = min(UPDATES_PER_SAMPLE, updates - done)
                 batches = sample_mixture(sources, count, imagined=self.buffers.art, rng=self.rngs[name])
-                for key, value in learner.update(batches).items():
+                for key, value in learner.update(batches.to(self.device)).items():
                     means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + value.cpu() * (count / updates)
         return means
 

@@ -30,8 +30,9 @@ class Trial:
     Attributes:
         kind: of the design.
         design: ``[K, D]``.
-        predicted: Eq. 5 at this design when it was chosen, ``[K]``, or None.
-        best: highest evaluation return so far, ``[K]``; -inf of a run that has none, as one that has diverged before.
+        predicted: Eq. 5 at this design when it was chosen, ``[K]`` on the CPU, or None.
+        best: highest evaluation return so far, ``[K]`` on the CPU; -inf of a run that has none, as one that
+            has diverged before.
         next_episode: episodes that are over; with 0 the individual learner has not started yet.
     """
 

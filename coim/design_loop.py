@@ -35,7 +35,7 @@ def next_trial(algorithm: CoAdaptation) -> Trial:
     frozen = [*algorithm.divergence.places]
     if frozen:
         design = design.clone()
-        design[frozen] = algorithm.buffers.ind[0]["design"][frozen]
+        design[frozen] = algorithm.buffers.ind[0]["design"][frozen].to(design.device)
         predicted = None if predicted is None else algorithm.divergence.blank(predicted, (algorithm.index, 0))
     return Trial(kind, design, predicted, best=torch.full(algorithm.env.batch_size, -torch.inf))
 
@@ -55,16 +55,16 @@ def _next_design(algorithm: CoAdaptation) -> tuple[Kind, Tensor, Tensor | None]:
         found = [algorithm.search.maximise(fitness) for fitness in _fitness(algorithm)]
         return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
     draw = RandomDesigns(algorithm.env.design_spec)
-    design = draw(first[:1].expand(runs, -1), rng=algorithm.rngs["designs"])
+    design = draw(first[:1].cpu().expand(runs, -1), rng=algorithm.rngs["designs"]).to(first.device)
     return "random", design, _predict(algorithm, design)
 
 
 def _fitness(algorithm: CoAdaptation) -> list[Fitness]:
     """Eq. 5 of each run, over the same draw of start states; a run that has diverged has none to climb."""
-    states = algorithm.buffers.s0.sample(algorithm.num_start_states)
+    states = algorithm.buffers.s0.sample(algorithm.num_start_states).to(algorithm.device)
     policy, qvalue, precision = algorithm.population.policy, algorithm.population.qvalue, algorithm.precision
     runs = algorithm.env.batch_size.numel()
-    if runs == 1:
+    if policy.num_runs is None:
         return [DesignValue(policy, qvalue, states[:, 0], precision=precision)]
     return [
         DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k], precision=precision)
@@ -75,7 +75,7 @@ def _fitness(algorithm: CoAdaptation) -> list[Fitness]:
 
 
 def _predict(algorithm: CoAdaptation, design: Tensor) -> Tensor | None:
-    """Eq. 5 of a design that was not searched for, ``[K]``; None before there is a start state."""
+    """Eq. 5 of a design that was not searched for, ``[K]`` on the CPU; None before there is a start state."""
     if len(algorithm.buffers.s0) == 0:
         return None
-    return torch.stack([fitness(row.unsqueeze(0))[0] for fitness, row in zip(_fitness(algorithm), design)])
+    return torch.stack([fitness(row.unsqueeze(0))[0] for fitness, row in zip(_fitness(algorithm), design)]).cpu()

@@ -34,7 +34,8 @@ def run_episode(
         policy: who acts; None draws every action uniformly.
         design: ``[K, D]`` bodies to build before the episode; None keeps the present ones.
         deterministic: act with the mode of the policy instead of a sample.
-        rng: where the actions' noise comes from; None uses torch's default generator.
+        rng: where the actions' noise comes from; None uses torch's default generator of the CPU. Drawn on the CPU, an
+            episode is the same on each device, to rounding.
 
     Returns:
         Rows ``[T, K]`` in the transition schema.
@@ -105,8 +106,9 @@ def _noise(
     device: torch.device,
 ) -> Tensor:
     """What randomness the whole episode needs: uniform actions, standard normal noise, or none, ``[T, K, A]``."""
-    if policy is None:
-        return torch.rand(steps, *shape, generator=rng, device=device) * 2 - 1
-    if deterministic:
+    if policy is not None and deterministic:
         return torch.empty(0, device=device)
-    return torch.randn(steps, *shape, generator=rng, device=device)
+    drawn_on = "cpu" if rng is None else rng.device
+    if policy is None:
+        return (torch.rand(steps, *shape, generator=rng, device=drawn_on) * 2 - 1).to(device)
+    return torch.randn(steps, *shape, generator=rng, device=drawn_on).to(device)

@@ -83,7 +83,7 @@ class ProbedCoAdaptation:
         self.swaps = {"noisy": NoisyDesigns(spec, sigma=sigma), "random": RandomDesigns(spec)}
         self.seen: list[TensorDict] = []  # [R, K] of each design
         # The other model draws its batches as the algorithm's own does; from the same state on they are the same.
-        self._rng = torch.Generator(algorithm.env.device or "cpu")
+        self._rng = torch.Generator(algorithm.rngs["model"].device)
         self._rng.set_state(algorithm.rngs["model"].get_state())
         self._table: Table | None = None
 
@@ -154,10 +154,11 @@ class ProbedCoAdaptation:
     def _learn(self) -> None:
         """Let the other model learn what the algorithm's own has just learnt."""
         algorithm, pop = self.algorithm, self.algorithm.buffers.pop
-        self.other.observe(pop[len(pop) - algorithm.env.episode_steps :])
+        self.other.observe(pop[len(pop) - algorithm.env.episode_steps :].to(algorithm.device))
         for done in range(0, algorithm.model_updates, UPDATES_PER_SAMPLE):
             count = min(UPDATES_PER_SAMPLE, algorithm.model_updates - done)
-            self.other.update(sample_mixture([(pop, algorithm.batch_size)], count, rng=self._rng))
+            batches = sample_mixture([(pop, algorithm.batch_size)], count, rng=self._rng)
+            self.other.update(batches.to(algorithm.device))
 
     def _measure(self, event: EpisodeDone) -> None:
         """All that is measured after an episode."""

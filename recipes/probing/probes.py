@@ -90,7 +90,7 @@ class Probes:
 
     def _begin(self, env: MorphEnv, seed: int) -> torch.Generator:
         env.set_seed(seed)
-        return torch.Generator(env.device or "cpu").manual_seed(seed)
+        return torch.Generator().manual_seed(seed)
 
     def _thinned(self, rows: TensorDictBase, rng: torch.Generator) -> TensorDict:
         """R of the rows along the first dimension, or all where there are fewer, of what a test needs."""

@@ -1,0 +1,188 @@
+"""What the parts of Algorithm 1 must agree on, checked when they are put together.
+
+Parts that do not fit would run for hours until one of them is needed, or to the end with wrong numbers. Each check
+names the part, what it should be, and the way out.
+
+Shapes: K runs, I first designs, N rows that are tried, D design, S observation, A action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from coim.designs import DesignGenerator
+from coim.dynamics_learner import DynamicsLearner
+from coim.envs.morph import MorphEnv
+from coim.envs.world_model import WorldModelEnv
+from coim.learner import SACLearner
+from coim.models.ensemble import GaussianEnsemble
+
+PRECISIONS = ("float32", "bfloat16")
+TRIES = 16  # draws of G from each design that is tried
+
+
+def check_counts(counts: Mapping[str, int], updates: Mapping[str, int]) -> None:
+    """Refuse counts below 1 and updates below 0, by their names."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} is {count}, it must be at least 1")
+    for name, count in updates.items():
+        if count < 0:
+            raise ValueError(f"{name} is {count}, it must be at least 0 (0 does not train)")
+
+
+def check_precision(precision: str) -> None:
+    """Refuse a precision that Eq. 5 would meet at the first search."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
+
+
+def check_bodies(env: MorphEnv, evaluation_env: MorphEnv) -> None:
+    """Refuse evaluation bodies that are those of training, or are paid for something else."""
+    if env is evaluation_env:
+        raise ValueError(
+            "env and evaluation_env are one environment, and evaluating would change training; make two, with seeds of "
+            "their own"
+        )
+    one, another = type(env), type(evaluation_env)
+    if one is not another:
+        raise ValueError(
+            f"evaluation_env is a {another.__name__}, env a {one.__name__}; make both of one class, so that a run is "
+            "judged by what it learns"
+        )
+    for what, own, other in (
+        ("task", env.task, evaluation_env.task),
+        ("batch size", list(env.batch_size), list(evaluation_env.batch_size)),
+        ("device", str(env.device or "cpu"), str(evaluation_env.device or "cpu")),
+    ):
+        if own != other:
+            raise ValueError(f"evaluation_env has {what} {other}, env has {own}; make both alike but for their seeds")
+
+
+def check_learners(
+    env: MorphEnv,
+    population: SACLearner,
+    individual: SACLearner,
+    dynamics: DynamicsLearner | None,
+    *,
+    side_by_side: bool,
+) -> torch.device:
+    """Refuse learners that share weights, lack the run axis of the bodies, or live apart.
+
+    Returns:
+        The device of all of them.
+    """
+    if population is individual:
+        raise ValueError("population and individual are one learner; make two, with networks of their own")
+    for name in ("policy", "qvalue"):
+        if getattr(population, name) is getattr(individual, name):
+            raise ValueError(f"population and individual share their {name}; make one for each of them")
+    learners = {"population": population, "individual": individual, "dynamics": dynamics}
+    runs, devices = env.batch_size.numel(), {}
+    for name, learner in learners.items():
+        if learner is None:
+            continue
+        if (learner.num_runs or 1) != runs:
+            raise ValueError(
+                f"{name} has num_runs={learner.num_runs}, the bodies have {runs} run(s); make its networks and itself "
+                f"with num_runs={runs}"
+            )
+        devices[name] = learner.weights_by_run()[0].device
+    device = devices["population"]
+    for name, other in devices.items():
+        if other != device:
+            raise ValueError(f"population is on {device}, {name} on {other}; make all learners on one device")
+    if side_by_side and device.type != "cpu":
+        raise ValueError(
+            f"side_by_side=True is for learners on the CPU, these are on {device}: two threads would wait for one "
+            "device, and could not be captured in its graphs; leave it out"
+        )
+    return device
+
+
+def check_dream(
+    env: MorphEnv,
+    dynamics: DynamicsLearner | None,
+    dream: WorldModelEnv | None,
+    generator: DesignGenerator | None,
+    first_designs: Tensor,
+) -> None:
+    """Refuse a dream of which nothing is learnt, that pays otherwise than the bodies, or is asked for no bodies."""
+    if (dream is None) != (generator is None):
+        raise ValueError("imagining needs both a dream and a generator; give both, or neither for the baseline")
+    if dream is None or generator is None:
+        return
+    model = dream.ensemble
+    if isinstance(model, GaussianEnsemble):
+        if dynamics is not None and model is not dynamics.ensemble:
+            raise ValueError(
+                "the dream steps another ensemble than the one that dynamics trains; make it with dynamics.ensemble"
+            )
+        if dynamics is None and not model.inputs.count.any():
+            raise ValueError(
+                "the dream steps an ensemble that has seen nothing and that nobody trains; give its learner as dynamics"
+            )
+    _check_rewards(env, dream)
+    _check_generator(env, generator, first_designs)
+
+
+def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:
+    """Compare the rewards of dream and bodies on a few rows that stand for all."""
+    sizes = [
+        {
+            "observation": made.observation_spec["observation"].shape[-1],
+            "action": made.action_spec.shape[-1],
+            "design": made.design_spec.shape[-1],
+        }
+        for made in (env, dream)
+    ]
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"the dream has sizes {sizes[1]}, the bodies {sizes[0]}; make the dream of these bodies")
+    rng = torch.Generator().manual_seed(0)
+    observation, action, following, design = (
+        torch.randn(TRIES, sizes[0][key], generator=rng).to(env.device or "cpu")
+        for key in ("observation", "action", "observation", "design")
+    )
+    row = (observation, action.tanh(), following, design.sigmoid() + 0.5)
+    if not torch.allclose(dream.reward_fn(*row), env.reward_fn(*row)):
+        raise ValueError(
+            "the dream pays other rewards than the bodies: it was made of another body or task; make it of this env"
+        )
+
+
+def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: Tensor) -> None:
+    """Try G on the first designs and on two corners; torch's global generators stay as they are."""
+    low, high = env.design_spec.space.low, env.design_spec.space.high
+    tried = torch.cat([first_designs, low[None], high[None]]).repeat(TRIES, 1)
+    tried = tried.unsqueeze(1).expand(-1, env.batch_size.numel(), -1)  # [N, K, D]
+    with torch.random.fork_rng(devices=[tried.device] if tried.device.type == "cuda" else []):
+        found = generator(tried, rng=torch.Generator(tried.device).manual_seed(0))
+    if found.shape != tried.shape:
+        raise ValueError(
+            f"the generator makes designs {list(found.shape)} of designs {list(tried.shape)}; it must keep their shape"
+        )
+    outside = ~((low <= found) & (found <= high)).all(-1)  # NaN is neither
+    if outside.any():
+        raise ValueError(
+            f"the generator makes {found[outside][0].tolist()} of {tried[outside][0].tolist()}, which leaves "
+            f"[{low.tolist()}, {high.tolist()}]; let it end with design_spec.project()"
+        )
+
+
+def check_first_designs(env: MorphEnv, first_designs: Tensor) -> None:
+    """Refuse first designs that the bodies or the networks could not take, of which the last is built hours later."""
+    spec, low, high = env.design_spec, env.design_spec.space.low, env.design_spec.space.high
+    if first_designs.ndim != 2 or first_designs.shape[1:] != spec.shape or not len(first_designs):
+        raise ValueError(
+            f"first_designs has shape {list(first_designs.shape)}, expected [I, {spec.shape[0]}] with at least one row"
+        )
+    if first_designs.device != low.device or first_designs.dtype != spec.dtype:
+        raise ValueError(
+            f"first_designs are {first_designs.dtype} on {first_designs.device}, the bodies take {spec.dtype} on "
+            f"{low.device}; move them by first_designs.to({str(low.device)!r}, {spec.dtype})"
+        )
+    if not ((low <= first_designs) & (first_designs <= high)).all():
+        raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")

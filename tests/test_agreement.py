@@ -1,0 +1,227 @@
+"""Parts that do not fit together are refused when Algorithm 1 is made, not when one of them is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from test_coadaptation import STEPS, small
+from torch import Tensor
+
+from coim import (
+    Buffers,
+    CoAdaptation,
+    DynamicsLearner,
+    EpisodeDone,
+    GaussianEnsemble,
+    GradientSearch,
+    HopperMorph,
+    KnownDesigns,
+    SACLearner,
+    WalkerMorph,
+    WorldModelEnv,
+    make_policy,
+    make_qvalue,
+)
+from coim.agreement import check_dream, check_learners
+
+ENV = HopperMorph(num_runs=2, episode_steps=STEPS, seed=0)
+
+
+def learner(num_runs: int | None = 2) -> SACLearner:
+    """A tiny one for hoppers."""
+    policy = make_policy(ENV, num_cells=(4,), num_runs=num_runs)
+    return SACLearner(policy, make_qvalue(ENV, num_cells=(4,), num_runs=num_runs), num_runs=num_runs)
+
+
+def sharing(name: str) -> dict[str, SACLearner]:
+    """Two learners with one policy, or one pair of critics."""
+    one, other = learner(), learner()
+    both = {"policy": one.policy, "qvalue": one.qvalue, name: getattr(other, name)}
+    return {"population": other, "individual": SACLearner(*both.values(), num_runs=2)}
+
+
+def ensemble(num_runs: int | None = 2) -> GaussianEnsemble:
+    """A tiny one for hoppers."""
+    return GaussianEnsemble.for_env(ENV, num_cells=(4,), num_runs=num_runs)
+
+
+def dreaming(**parts: Any) -> dict[str, Any]:
+    """All that imagination needs, with some of it exchanged."""
+    learnt = ensemble()
+    dream = WorldModelEnv(learnt, ENV, batch_size=[2])
+    return {"dynamics": DynamicsLearner(learnt, num_runs=2), "dream": dream, "generator": KnownDesigns()} | parts
+
+
+def algorithm(**parts: Any) -> CoAdaptation:
+    """Two runs of the baseline, with some parts exchanged."""
+    given: dict[str, Any] = {
+        "evaluation_env": HopperMorph(num_runs=2, episode_steps=STEPS, seed=1),
+        "population": learner(),
+        "individual": learner(),
+        "buffers": Buffers.for_env(ENV, pop_capacity=90, ind_capacity=90, s0_capacity=9, art_capacity=90, seed=0),
+        "search": GradientSearch(ENV.design_spec, num_starts=2, num_steps=2, seed=0),
+        "first_designs": torch.ones(1, 4),
+        "individual_updates": 2,
+        "population_updates": 2,
+        "model_updates": 2,
+    }
+    return CoAdaptation(ENV, **given | parts)
+
+
+def beyond(design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+    """A G with noise and no bounds."""
+    return design + 0.3 * torch.randn(design.shape, generator=rng)
+
+
+def flat(design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+    """A G that loses the run axis."""
+    return design.flatten(0, 1)
+
+
+def unlike(**settings: Any) -> HopperMorph:
+    """Evaluation bodies that differ in one setting."""
+    return HopperMorph(**{"num_runs": 2, "episode_steps": STEPS, "seed": 1} | settings)
+
+
+def dream_of(**settings: Any) -> dict[str, Any]:
+    """A dream that was made of other bodies than those of training."""
+    learnt = ensemble()
+    dream = WorldModelEnv(learnt, HopperMorph(num_runs=2, seed=0, **settings), batch_size=[2])
+    return dreaming(dynamics=DynamicsLearner(learnt, num_runs=2), dream=dream)
+
+
+def walking_dream() -> dict[str, Any]:
+    """A dream of another body, sizes and all."""
+    walker = WalkerMorph(num_runs=2, seed=0)
+    learnt = GaussianEnsemble.for_env(walker, num_cells=(4,), num_runs=2)
+    return dreaming(dynamics=DynamicsLearner(learnt, num_runs=2), dream=WorldModelEnv(learnt, walker, batch_size=[2]))
+
+
+def one_for_both() -> dict[str, SACLearner]:
+    """The same learner twice."""
+    return dict.fromkeys(("population", "individual"), learner())
+
+
+REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
+    "precision": (lambda: {"precision": "bf16"}, "precision='bf16' is unknown; choose 'float32' or 'bfloat16'"),
+    "one environment": (lambda: {"evaluation_env": ENV}, "env and evaluation_env are one environment"),
+    "another body": (
+        lambda: {"evaluation_env": WalkerMorph(num_runs=2, seed=1)},
+        "evaluation_env is a WalkerMorph, env a HopperMorph",
+    ),
+    "another task": (
+        lambda: {"evaluation_env": unlike(task="backward")},
+        "evaluation_env has task backward, env has forward",
+    ),
+    "fewer runs": (
+        lambda: {"evaluation_env": unlike(num_runs=1)},
+        r"evaluation_env has batch size \[1\], env has \[2\]",
+    ),
+    "one learner": (one_for_both, "population and individual are one learner"),
+    "one policy": (lambda: sharing("policy"), "population and individual share their policy"),
+    "one critic": (lambda: sharing("qvalue"), "population and individual share their qvalue"),
+    "no run axis": (
+        lambda: {"individual": learner(None)},
+        r"individual has num_runs=None, the bodies have 2 run\(s\); make .* num_runs=2",
+    ),
+    "too many runs": (lambda: {"population": learner(3)}, "population has num_runs=3"),
+    "a model without run axis": (
+        lambda: dreaming(dynamics=DynamicsLearner(ensemble(None))),
+        "dynamics has num_runs=None",
+    ),
+    "no dream": (lambda: {"generator": KnownDesigns()}, "needs both a dream and a generator"),
+    "a dream that nobody trains": (
+        lambda: dreaming(dynamics=DynamicsLearner(ensemble(), num_runs=2)),
+        r"another ensemble than the one that dynamics trains; make it with dynamics\.ensemble",
+    ),
+    "a dream that saw nothing": (lambda: dreaming(dynamics=None), "has seen nothing and that nobody trains"),
+    "a dream of another task": (lambda: dream_of(task="backward"), "pays other rewards than the bodies"),
+    "a dream of another body": (walking_dream, r"the dream has sizes \{'observation': 18"),
+    "G leaves the bounds": (lambda: dreaming(generator=beyond), r"the generator makes \[.*\] of \[.*\], which leaves"),
+    "G of another shape": (lambda: dreaming(generator=flat), r"makes designs \[96, 4\] of designs \[48, 2, 4\]"),
+    "no first design": (lambda: {"first_designs": torch.ones(0, 4)}, "with at least one row"),
+    "a first design of NaN": (lambda: {"first_designs": torch.full((1, 4), torch.nan)}, "a first design of .* leaves"),
+    "double first designs": (
+        lambda: {"first_designs": torch.ones(1, 4, dtype=torch.float64)},
+        "are torch.float64 on cpu, the bodies take torch.float32",
+    ),
+    "first designs elsewhere": (
+        lambda: {"first_designs": torch.ones(1, 4, device="meta")},
+        r"on meta, the bodies take .* on cpu; move them by first_designs\.to\('cpu', torch\.float32\)",
+    ),
+}
+
+
+@pytest.mark.parametrize(("parts", "sentence"), REFUSED.values(), ids=REFUSED)
+def test_parts_that_do_not_fit_are_refused(parts: Callable[[], dict[str, Any]], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        algorithm(**parts())
+
+
+def test_trying_g_moves_no_generator_that_others_draw_from() -> None:
+    def heedless(design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+        return design + 0 * torch.rand(design.shape)
+
+    parts = dreaming()
+    before = torch.random.get_rng_state()
+    check_dream(ENV, parts["dynamics"], parts["dream"], heedless, torch.ones(1, 4))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_an_ensemble_that_has_learnt_elsewhere_may_be_dreamt_of_without_a_learner() -> None:
+    learnt = ensemble()
+    learnt.update_statistics(ENV.rollout(4).transpose(0, 1))
+    algorithm(**dreaming(dynamics=None, dream=WorldModelEnv(learnt, ENV, batch_size=[2])))
+
+
+def test_learners_go_side_by_side_on_the_cpu_alone() -> None:
+    def elsewhere() -> Any:
+        weights = [torch.empty(2, device="meta")]
+        return SimpleNamespace(num_runs=2, policy=object(), qvalue=object(), weights_by_run=lambda: weights)
+
+    with pytest.raises(ValueError, match="side_by_side=True is for learners on the CPU, these are on meta"):
+        check_learners(ENV, elsewhere(), elsewhere(), None, side_by_side=True)
+    assert check_learners(ENV, elsewhere(), elsewhere(), None, side_by_side=False).type == "meta"
+    with pytest.raises(ValueError, match="population is on meta, dynamics on cpu"):
+        check_learners(ENV, elsewhere(), elsewhere(), DynamicsLearner(ensemble(), num_runs=2), side_by_side=False)
+
+
+def test_batches_are_moved_to_the_learners_once_per_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = small(first_episodes=1, num_designs=1)
+    list(made)
+    made.device = torch.device("meta")  # stands for a GPU
+    seen: list[tuple[str, int]] = []
+
+    def update(batches: Any) -> dict[str, Tensor]:
+        seen.append((batches["action"].device.type, len(batches)))
+        return {}
+
+    monkeypatch.setattr(made.population, "update", update)
+    made._train("population", made.population, made.population_parts, 120, {})
+    assert seen == [("meta", 50), ("meta", 50), ("meta", 20)]
+
+
+def test_a_fleet_of_one_run_searches_for_its_body() -> None:
+    torch.manual_seed(0)
+    env, evaluation_env = (HopperMorph(episode_steps=STEPS, seed=seed) for seed in (0, 1))
+    buffers = Buffers.for_env(env, pop_capacity=90, ind_capacity=90, s0_capacity=9, art_capacity=9, seed=0)
+    made = CoAdaptation(
+        env,
+        evaluation_env,
+        population=learner(1),
+        individual=learner(1),
+        buffers=buffers,
+        search=GradientSearch(env.design_spec, num_starts=2, num_steps=2, seed=0),
+        first_designs=torch.ones(1, 4),
+        num_designs=2,
+        first_episodes=1,
+        episodes=1,
+        individual_updates=1,
+        population_updates=1,
+        batch_size=4,
+    )
+    assert [event.kind for event in made if isinstance(event, EpisodeDone)] == ["first", "optimised"]
