@@ -1,32 +1,91 @@
 """Co-imagination of behaviour and morphology: components that improve a robot's body and controller together.
 
-Everything that is public, in one flat list. Importing it starts nothing, reads nothing and prints nothing.
+Everything that is public, in one flat list. Importing it starts nothing, reads nothing and prints nothing. A name is
+imported when it is first asked for: losses and networks work where mujoco and pyswarms are not installed.
 """
 
-# First, before TorchRL imports mujoco itself: a missing OpenGL library is then said in one sentence.
-from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
+from __future__ import annotations
 
-# isort: split
-from coim.batches import batch_parts, sample_batches, sample_mixture
-from coim.buffers import Buffers, TransitionBuffer, transition_rows
-from coim.coadaptation import CoAdaptation
-from coim.designs import (
-    DesignGenerator,
-    DesignSearch,
-    GradientSearch,
-    KnownDesigns,
-    NoisyDesigns,
-    ParticleSwarm,
-    RandomDesigns,
-)
-from coim.dynamics_learner import DynamicsLearner
-from coim.episode import run_episode
-from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
-from coim.imagination import imagine
-from coim.learner import SACLearner
-from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, StackedMLP, make_policy, make_qvalue, select_run
-from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
-from coim.saved_run import Agent, SavedRun, TriedDesign, load_run
+from typing import TYPE_CHECKING
+
+# First, before TorchRL imports mujoco itself: a missing OpenGL library is then said in one sentence.
+import coim.envs  # noqa: F401
+from coim.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from coim.batches import batch_parts, sample_batches, sample_mixture
+    from coim.buffers import Buffers, TransitionBuffer, transition_rows
+    from coim.coadaptation import CoAdaptation
+    from coim.designs import (
+        DesignGenerator,
+        DesignSearch,
+        GradientSearch,
+        KnownDesigns,
+        NoisyDesigns,
+        ParticleSwarm,
+        RandomDesigns,
+    )
+    from coim.dynamics_learner import DynamicsLearner
+    from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
+    from coim.episode import run_episode
+    from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
+    from coim.imagination import imagine
+    from coim.learner import SACLearner
+    from coim.models import (
+        GaussianEnsemble,
+        NetworkSizes,
+        Policy,
+        QValue,
+        StackedMLP,
+        make_policy,
+        make_qvalue,
+        select_run,
+    )
+    from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
+    from coim.saved_run import Agent, SavedRun, TriedDesign, load_run
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "batches": ["batch_parts", "sample_batches", "sample_mixture"],
+            "buffers": ["Buffers", "TransitionBuffer", "transition_rows"],
+            "coadaptation": ["CoAdaptation"],
+            "designs": [
+                "DesignGenerator",
+                "DesignSearch",
+                "GradientSearch",
+                "KnownDesigns",
+                "NoisyDesigns",
+                "ParticleSwarm",
+                "RandomDesigns",
+            ],
+            "dynamics_learner": ["DynamicsLearner"],
+            "envs": [
+                "HalfCheetahMorph",
+                "HopperMorph",
+                "MorphEnv",
+                "SimulatorDynamics",
+                "WalkerMorph",
+                "WorldModelEnv",
+            ],
+            "episode": ["run_episode"],
+            "events": ["DesignChosen", "DesignDone", "EpisodeDone", "Event"],
+            "imagination": ["imagine"],
+            "learner": ["SACLearner"],
+            "models": [
+                "GaussianEnsemble",
+                "NetworkSizes",
+                "Policy",
+                "QValue",
+                "StackedMLP",
+                "make_policy",
+                "make_qvalue",
+                "select_run",
+            ],
+            "objectives": ["CoImSACLoss", "DesignValue", "EnsembleNLLLoss"],
+            "saved_run": ["Agent", "SavedRun", "TriedDesign", "load_run"],
+        },
+    )
 
 __version__ = "0.1.0"
 

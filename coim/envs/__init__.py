@@ -1,23 +1,42 @@
 """Robots whose bodies are set by a design, as TorchRL environments."""
 
+from __future__ import annotations
+
 import os
+from typing import TYPE_CHECKING
+
+from coim.lazy import lazy_names
 
 try:
     import mujoco  # noqa: F401
+except ModuleNotFoundError:
+    pass  # the dream does without; the bodies, when they are asked for, say that it is missing
 except AttributeError as error:  # PyOpenGL's way to say that the library which MUJOCO_GL names is not installed
     raise ImportError(
         f"MUJOCO_GL={os.environ.get('MUJOCO_GL')} names an OpenGL library that is missing: unset MUJOCO_GL, or install "
         "the library (Debian: apt-get install libegl1 libegl-mesa0 for egl, libosmesa6 for osmesa)"
     ) from error
 
-from coim.envs.half_cheetah import HalfCheetahMorph
-from coim.envs.hopper import HopperMorph
-from coim.envs.morph import MorphEnv
-from coim.envs.simulator_dream import SimulatorDynamics
-from coim.envs.walker import WalkerMorph
-from coim.envs.world_model import WorldModelEnv
-
-# By the names of their recipes, which stand in a run's config.json.
-BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph, "walker": WalkerMorph}
+if TYPE_CHECKING:
+    from .bodies import BODIES
+    from .half_cheetah import HalfCheetahMorph
+    from .hopper import HopperMorph
+    from .morph import MorphEnv
+    from .simulator_dream import SimulatorDynamics
+    from .walker import WalkerMorph
+    from .world_model import WorldModelEnv
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "bodies": ["BODIES"],
+            "half_cheetah": ["HalfCheetahMorph"],
+            "hopper": ["HopperMorph"],
+            "morph": ["MorphEnv"],
+            "simulator_dream": ["SimulatorDynamics"],
+            "walker": ["WalkerMorph"],
+            "world_model": ["WorldModelEnv"],
+        },
+    )
 
 __all__ = ["BODIES", "HalfCheetahMorph", "HopperMorph", "MorphEnv", "SimulatorDynamics", "WalkerMorph", "WorldModelEnv"]

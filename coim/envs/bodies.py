@@ -1,0 +1,10 @@
+"""The bodies of this library by the names of their recipes, which stand in a run's ``config.json``."""
+
+from __future__ import annotations
+
+from coim.envs.half_cheetah import HalfCheetahMorph
+from coim.envs.hopper import HopperMorph
+from coim.envs.morph import MorphEnv
+from coim.envs.walker import WalkerMorph
+
+BODIES: dict[str, type[MorphEnv]] = {"half_cheetah": HalfCheetahMorph, "hopper": HopperMorph, "walker": WalkerMorph}
