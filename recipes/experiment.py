@@ -12,7 +12,7 @@ from coim import CoAdaptation, DesignChosen, EpisodeDone, MorphEnv
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints, refuse_lost_checkpoints
 from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
-from recipes.machine import available_cores, check_compiler, checked_device, prepare
+from recipes.machine import available_cores, check_compiler, checked_device, choose_products, prepare, words_of
 from recipes.parts import build, episodes_of_designs
 from recipes.progress import Progress
 from recipes.report import write_report
@@ -71,16 +71,24 @@ def train(
     folder = settings.resume or settings.out or default_folder(name, settings)
     if settings.resume is None:
         refuse_filled(folder)
+        products = choose_products(settings.products)
     else:
         check_origin(folder, name)
         refuse_lost_checkpoints(folder)
+        config = read_config(folder)
+        changed = config["settings"]["products"] != settings.products
+        products = choose_products(settings.products, begun=config["products"], changed=changed)
     if settings.compile:
         check_compiler()
     algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
         how = "compiled in the first episode" if settings.compile else "not compiled"
-        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how} -> {folder}")
+        on_cpu = settings.device == "cpu"
+        by = f", products by {words_of(products)}" if on_cpu else ""
+        print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how}{by} -> {folder}")
+        if on_cpu and settings.precision == "bfloat16" and products.bfloat16 == "emulated":
+            print("bfloat16 is emulated by float32 products here, which is slower than --precision float32")
     again = f"to go on: {again} {folder}"
     with locked(folder):
         try:

@@ -1,4 +1,4 @@
-"""What a run takes of the machine it finds: threads, memory, device."""
+"""What a run takes of the machine it finds: threads, memory, device, products."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import ctypes
 import logging
 import os
 import shutil
+import sys
+from collections.abc import Mapping
 
 import torch
+
+from coim.products import Choice, Library, Named, use
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 KEPT = 1 << 30  # bytes
@@ -54,6 +58,44 @@ def prepare(threads: int, device: torch.device) -> bool:
     torch.set_num_threads(1)
     keep_freed_memory()
     return threads > 1 and device.type == "cpu"
+
+
+def choose_products(wanted: Named, *, begun: Mapping[str, Library] | None = None, changed: bool = False) -> Choice:
+    """Choose the library of all products on the CPU, and say where a run that goes on may round otherwise from here.
+
+    Args:
+        wanted: the setting.
+        begun: what was chosen so far for the run that goes on; it is kept unless the setting was changed, or this
+            machine cannot take it.
+        changed: whether the setting is another one than before.
+
+    Raises:
+        ValueError: if this machine has not the library that was named.
+    """
+    here = use(wanted)
+    if begun is None or (kept := Choice(**begun)) == here:
+        return here
+    why = ""
+    if not changed:
+        try:
+            use(kept)
+        except ValueError as error:
+            why = f" ({error})"
+        else:
+            told = f"products stay by {words_of(kept)}, as the run began; a new one would take {words_of(here)} here"
+            print(f"warning: {told}; the numbers may differ from here", file=sys.stderr)
+            return kept
+    told = f"products were by {words_of(kept)} and are by {words_of(here)}{why}"
+    print(f"warning: {told}; the numbers may differ from here", file=sys.stderr)
+    return here
+
+
+def words_of(products: Choice) -> str:
+    """A choice in a few words: ``torch``, or ``torch, bfloat16 emulated``."""
+    if products.bfloat16 == products.float32:
+        return products.float32
+    bfloat16 = "emulated" if products.bfloat16 == "emulated" else f"by {products.bfloat16}"
+    return f"{products.float32}, bfloat16 {bfloat16}"
 
 
 def keep_freed_memory() -> None:

@@ -17,6 +17,7 @@ from typing import Any
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
+from coim.products import chosen
 from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
 from recipes.writing import shortest, write_whole
@@ -265,6 +266,7 @@ def describe(environment: str, settings: Settings) -> dict[str, Any]:
     return {
         "environment": environment,
         "settings": plain(settings),
+        "products": chosen()._asdict(),
         "versions": versions(),
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
         "revision": git_revision(),
@@ -277,10 +279,12 @@ def note_resumption(folder: Path, settings: Settings) -> None:
     """Write into ``config.json`` that the run went on: when, by which code, and with which other settings."""
     config = read_config(folder)
     moved = changes(saved_settings(folder), settings)
+    products = chosen()._asdict()
     config["settings"] = plain(dataclasses.replace(settings, resume=None))
+    config["products"] = products
     config["resumed"] = [
         *config.get("resumed", []),
-        {"at": now(), "revision": git_revision(), "versions": versions(), "changed": moved},
+        {"at": now(), "revision": git_revision(), "products": products, "versions": versions(), "changed": moved},
     ]
     write_whole(folder / "config.json", json.dumps(config, indent=2) + "\n")
 

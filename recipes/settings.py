@@ -106,6 +106,9 @@ class Settings:
     # -- this machine -------------------------------------------------------------------------------------------------
     precision: Literal["float32", "bfloat16"] = "float32"
     """Of the networks' products; weights, moments, targets and losses stay float32."""
+    products: Literal["auto", "onednn", "torch"] = "auto"
+    """Library that multiplies on the CPU: what was measured to be fastest on such a processor, or one by name. A run
+    that is gone on with keeps that of its first part."""
     compile: bool = False
     """Compile the learners' gradients in the first update (torch.compile): seconds to a minute, then faster updates.
     On in preset paper."""
@@ -140,8 +143,9 @@ QUICK = Settings(
     name="quick",
 )
 
-# What may differ when a run is gone on with, because no number of its past depends on it.
-FREE = {"num_designs", "threads", "checkpoint_every", "resume", "wandb", "quiet"}
+# What may differ when a run is gone on with, because no number of its past depends on it. Other products round the
+# numbers to come otherwise, as other versions do.
+FREE = {"num_designs", "threads", "products", "checkpoint_every", "resume", "wandb", "quiet"}
 # What the parts of a run refuse in their own words, or not at all; here by the option's name and before there is a run.
 ALLOWED: dict[Interval, tuple[str, ...]] = {
     Interval(1): (
