@@ -11,14 +11,15 @@ from typing import Any
 from coim import CoAdaptation, DesignChosen, EpisodeDone, MorphEnv
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints, refuse_lost_checkpoints
+from recipes.forecast import Forecast, work_of
 from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, choose_products, prepare, words_of
-from recipes.parts import build, episodes_of_designs
+from recipes.parts import build
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
 from recipes.results import Results, default_folder, refuse_filled, versions
-from recipes.settings import Settings, parse, read_config
+from recipes.settings import QUICK, Settings, parse, read_config
 from recipes.wandb_log import WandbLog
 
 
@@ -119,10 +120,9 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
     results = Results(folder, name, settings, names, notes=notes)
     progress = Progress(
         num_designs=settings.num_designs,
-        total_episodes=sum(episodes_of_designs(type(algorithm.env), settings)),
+        forecast=forecast_of(algorithm, settings),
         updates=algorithm.updates_per_episode,
         imagined_share=algorithm.population_parts.imagined / settings.batch_size,
-        done=algorithm.env_steps // settings.episode_steps,
         best=None if trial is None else trial.best,
         quiet=settings.quiet,
     )
@@ -145,6 +145,15 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         print("every run has diverged: there is nothing left to learn, and this ends here", file=sys.stderr)
     if not settings.quiet:
         print(results.table())
+
+
+def forecast_of(algorithm: CoAdaptation, settings: Settings) -> Forecast:
+    """How long the run will take from where it stands; beside preset paper also how long a first look takes."""
+    body, chosen = type(algorithm.env), algorithm.index + (algorithm.trial is not None)
+    left = work_of(body, settings, episodes=algorithm.env_steps // settings.episode_steps, designs=chosen)
+    quick = work_of(body, QUICK)
+    shorter = settings.preset != "quick" and quick.episodes < left.episodes
+    return Forecast(left, goes_on=settings.resume is not None, quick=quick if shorter else None)
 
 
 def check_origin(folder: Path, name: str) -> None:

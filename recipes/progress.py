@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
-import time
 from typing import TextIO
 
 import torch
@@ -12,20 +12,21 @@ from torch import Tensor
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
+from recipes.forecast import Forecast
 
 
 class Progress:
     """Follows the events of a run.
 
     Returns and model errors are means over the runs that have one. A live line that is too long for its terminal is
-    written in a short form, so that the time left stays in sight on 80 columns.
+    written in a short form, so that the time left stays in sight on 80 columns. A line of its own says how long the run
+    will take, as soon as that is known.
 
     Args:
         num_designs: M.
-        total_episodes: of the whole run, for the time left.
+        forecast: of the time left.
         updates: network updates after each episode, for the speed.
         imagined_share: of a population batch.
-        done: episodes that were over before.
         best: return of each run on the present design before, ``[K]``, if there is one.
         stream: where to write; None takes standard output.
         quiet: write nothing.
@@ -35,22 +36,22 @@ class Progress:
         self,
         *,
         num_designs: int,
-        total_episodes: int,
+        forecast: Forecast,
         updates: int,
         imagined_share: float = 0.0,
-        done: int = 0,
         best: Tensor | None = None,
         stream: TextIO | None = None,
         quiet: bool = False,
     ) -> None:
-        self._num_designs, self._total, self._updates = num_designs, total_episodes - done, updates
+        self._num_designs, self._forecast, self._updates = num_designs, forecast, updates
         self._imagined_share = imagined_share
         self._stream, self._quiet = stream or sys.stdout, quiet
         self._live = self._stream.isatty()
-        self._episodes, self._best, self._started = 0, best, time.perf_counter()
+        self._episodes, self._best = 0, best
 
     def show(self, event: DesignChosen | EpisodeDone | DesignDone) -> None:
         """Write the line of an episode, and warn of what went wrong in it; other events move the state only."""
+        self._forecast.follow(event)
         if isinstance(event, DesignChosen):
             self._best = None
         if not isinstance(event, EpisodeDone):
@@ -62,6 +63,9 @@ class Progress:
         self._episodes += 1
         last = event.evaluation_return.cpu()
         self._best = last if self._best is None else torch.fmax(self._best, last)
+        if sentence := self._forecast.sentence:
+            self.end()
+            self._stream.write(sentence + "\n")
         long, short = self._lines(event, last, self._best)
         if self._live:
             width = shutil.get_terminal_size().columns - 1
@@ -83,7 +87,7 @@ class Progress:
         error = event.metrics.get("model_error")
         mean_error = "-" if error is None else f"{float(error.nanmean()):.3f}"
         speed = f"{self._updates / event.seconds['episode']:.0f}"
-        left = _clock((self._total - self._episodes) * (time.perf_counter() - self._started) / self._episodes)
+        left = _clock(self._forecast.seconds_left)
         share = f"{self._imagined_share:.0%}"
         long = [
             f"design {design}",
@@ -128,6 +132,8 @@ def _mean(returns: Tensor) -> float:
 
 
 def _clock(seconds: float) -> str:
+    if math.isnan(seconds):
+        return "-"
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}"

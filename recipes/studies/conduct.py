@@ -26,6 +26,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from coim.envs import BODIES
+from recipes.forecast import in_words
 from recipes.parts import episodes_of_designs
 from recipes.settings import Settings
 from recipes.studies.cell import compute, episodes_done, resumed, seconds_of, still_finished, tries
@@ -277,10 +278,3 @@ def lacking(resources: Resources) -> str:
 def all_episodes(cell: Cell) -> int:
     """Training episodes of a whole cell."""
     return sum(episodes_of_designs(BODIES[cell.environment], cell.settings))
-
-
-def in_words(seconds: float) -> str:
-    """A time as one would say it."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"

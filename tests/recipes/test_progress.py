@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from coim import DesignChosen, DesignDone, EpisodeDone
+from recipes.forecast import Forecast, Work
 from recipes.progress import Progress
 
 FIELDS = ("design 1/2 first", "episode 2", "return 5.0 (best 7.0)", "imagined 20%", "model error 0.250", "60 updates/s")
@@ -36,7 +37,9 @@ def episode(index: int, number: int, returns: list[float], *, error: float | Non
 
 
 def show_two(stream: io.StringIO, **options: bool) -> str:
-    progress = Progress(num_designs=2, total_episodes=4, updates=30, imagined_share=0.2, stream=stream, **options)
+    progress = Progress(
+        num_designs=2, forecast=Forecast(Work(4, 0, 30)), updates=30, imagined_share=0.2, stream=stream, **options
+    )
     design = torch.ones(2, 2)
     progress.show(DesignChosen(0, "first", design, None))
     progress.show(episode(0, 0, [6.0, 8.0]))
@@ -72,13 +75,24 @@ def test_a_narrow_terminal_still_sees_the_time_left(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
+def test_the_third_episode_says_on_a_line_of_its_own_how_long_the_run_takes(stream: io.StringIO) -> None:
+    progress = Progress(num_designs=1, forecast=Forecast(Work(9, 0, 30)), updates=30, stream=stream)
+    for number in range(4):
+        progress.show(episode(0, number, [1.0]))
+    lines = stream.getvalue().replace("\r", "\n").split("\n")
+    lines = [line for line in lines if line]
+    (at,) = [i for i, line in enumerate(lines) if line.startswith("this run takes about 0 s on this machine")]
+    assert at == 2  # after two episodes, before the third
+
+
+@pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
 def test_quiet_is_quiet(stream: io.StringIO) -> None:
     assert show_two(stream, quiet=True) == ""
 
 
 def test_the_best_return_is_that_of_the_design() -> None:
     stream = io.StringIO()
-    progress = Progress(num_designs=2, total_episodes=2, updates=30, stream=stream)
+    progress = Progress(num_designs=2, forecast=Forecast(Work(2, 0, 30)), updates=30, stream=stream)
     for index, value in enumerate((9.0, 3.0)):
         progress.show(DesignChosen(index, "first", torch.ones(1, 2), None))
         progress.show(episode(index, 0, [value], error=None))
@@ -88,7 +102,7 @@ def test_the_best_return_is_that_of_the_design() -> None:
 def test_the_best_of_a_fleet_is_the_mean_of_each_runs_best_also_of_one_that_goes_on() -> None:
     def told(best: torch.Tensor | None, returns: list[list[float]]) -> str:
         stream = io.StringIO()
-        progress = Progress(num_designs=1, total_episodes=9, updates=30, best=best, stream=stream)
+        progress = Progress(num_designs=1, forecast=Forecast(Work(9, 0, 30)), updates=30, best=best, stream=stream)
         for number, values in enumerate(returns):
             progress.show(episode(0, number, values))
         return stream.getvalue()
@@ -100,12 +114,14 @@ def test_the_best_of_a_fleet_is_the_mean_of_each_runs_best_also_of_one_that_goes
 
 def test_a_run_that_has_no_number_is_left_out_of_the_mean() -> None:
     stream = io.StringIO()
-    Progress(num_designs=1, total_episodes=2, updates=30, stream=stream).show(episode(0, 0, [float("nan"), 3.0]))
+    Progress(num_designs=1, forecast=Forecast(Work(2, 0, 30)), updates=30, stream=stream).show(
+        episode(0, 0, [float("nan"), 3.0])
+    )
     assert "return 3.0 (best 3.0)" in stream.getvalue()
     assert "nan" not in stream.getvalue()
 
 
 def test_an_interrupted_start_leaves_no_empty_line() -> None:
     stream = Terminal()
-    Progress(num_designs=1, total_episodes=1, updates=1, stream=stream).end()
+    Progress(num_designs=1, forecast=Forecast(Work(1, 0, 30)), updates=1, stream=stream).end()
     assert stream.getvalue() == ""

@@ -15,7 +15,7 @@ from coim.envs import BODIES
 from recipes.parts import build
 from recipes.settings import Settings, plain
 from recipes.studies.cell import compute, episodes_done, seconds_of, to_go_on, tries
-from recipes.studies.conduct import Resources, all_episodes, in_words, take_up
+from recipes.studies.conduct import Resources, all_episodes, take_up
 from recipes.studies.definition import ARMS, PROTOCOLS, Block, Study, from_json
 from recipes.studies.ledger import Ledger, State, read_ledger
 from recipes.studies.named import STUDIES
@@ -309,8 +309,3 @@ def test_the_study_of_the_readme_is_one(tmp_path: Path) -> None:
     cells = from_json(tmp_path / "mine.json").cells()
     assert [cell.arm for cell in cells] == ["none", "oracle"] * 3
     assert {cell.settings.episodes for cell in cells} == {20}
-
-
-@pytest.mark.parametrize(("seconds", "words"), [(12.3, "12 s"), (600, "10 min"), (9000, "2.5 h")])
-def test_times_are_said_as_one_would_say_them(seconds: float, words: str) -> None:
-    assert in_words(seconds) == words
