@@ -34,14 +34,8 @@ from recipes.machine import available_cores
 from recipes.plots.runs import Place, Run, Runs, read_runs
 from recipes.reporting.records import Row
 from recipes.settings import saved_settings
-from recipes.studies.conduct import (
-    Conductor,
-    Resources,
-    ray_running,
-    refuse_lack,
-    take_up,
-    without_words_of_ray,
-)
+from recipes.studies.cluster import ray_running, without_words_of_ray
+from recipes.studies.conduct import Conductor, Resources, refuse_lack, take_up
 from recipes.studies.definition import Cell
 from recipes.writing import shortest, write_whole
 
@@ -132,7 +126,7 @@ def retrain(asked: Retrain) -> list[str]:
         workers = asked.workers or available_cores()
         with (
             without_words_of_ray(folder) as terminal,
-            ray_running(address=asked.ray_address, workers=workers),
+            ray_running(terminal, address=asked.ray_address, workers=workers),
             stopping_at_once(),  # Ray takes SIGTERM for itself when it starts
         ):
             refuse_lack(resources, terminal, waits=asked.ray_address is not None)

@@ -19,15 +19,8 @@ import tyro
 
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores, checked_device
-from recipes.studies.conduct import (
-    RETRIES,
-    Conductor,
-    Resources,
-    ray_running,
-    refuse_lack,
-    take_up,
-    without_words_of_ray,
-)
+from recipes.studies.cluster import ray_running, without_words_of_ray
+from recipes.studies.conduct import RETRIES, Conductor, Resources, refuse_lack, take_up
 from recipes.studies.definition import Cell, Study, from_json, to_json
 from recipes.studies.ledger import Ledger
 from recipes.studies.named import STUDIES
@@ -71,7 +64,7 @@ def main(options: Options) -> None:
                 return
             with (
                 without_words_of_ray(folder) as terminal,
-                ray_running(address=options.ray_address, workers=workers, cpus=options.cpus),
+                ray_running(terminal, address=options.ray_address, workers=workers, cpus=options.cpus),
                 stopping_at_once(),  # once more: Ray takes SIGTERM for itself when it starts
             ):
                 refuse_lack(resources, terminal, waits=options.ray_address is not None)

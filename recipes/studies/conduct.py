@@ -1,26 +1,14 @@
 """Who computes the cells of a study: Ray, on this machine or on a cluster.
 
 Ray decides where and when, and tries again what failed; here is only what it is asked for and what its user hears.
-
-References:
-    Moritz et al.: Ray, a distributed framework for emerging AI applications, OSDI 2018; https://docs.ray.io.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import os
-import shutil
-import socket
-import sys
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any, TextIO
-
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
+from typing import TextIO
 
 import ray
 from ray.exceptions import RayError, RayTaskError
@@ -36,73 +24,6 @@ from recipes.studies.ledger import Ledger
 RETRIES = 2  # of a cell that fails, and of one whose process dies
 CELLS = "cells"  # of a study's folder
 POLL = 0.5  # s between two looks at who has begun
-ANSWER = 5.0  # s to wait for a cluster
-OBJECT_STORE = 80 * 2**20  # bytes; what a cell makes is on disk, nothing goes through Ray
-
-
-@contextmanager
-def ray_running(*, address: str | None = None, workers: int = 1, cpus: int = 1) -> Iterator[None]:
-    """Connect to a cluster, or be one for as long as this lasts.
-
-    Args:
-        address: of a cluster; None starts Ray on this machine.
-        workers: cells at once on this machine.
-        cpus: cores of each.
-    """
-    common: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address is not None:
-        refuse_silence(address)
-        ray.init(address=address, **common)
-        try:
-            yield
-        finally:
-            ray.shutdown()
-        return
-    temporary = tempfile.mkdtemp(prefix="ray-")
-    try:
-        ray.init(
-            address="local",  # whatever RAY_ADDRESS says
-            num_cpus=workers * cpus,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE,
-            _temp_dir=temporary,
-            **common,
-        )
-        yield
-    finally:
-        ray.shutdown()
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-@contextmanager
-def without_words_of_ray(folder: Path) -> Iterator[TextIO]:
-    """Let Ray, which reports each death of a process at length, write to ``logs/ray.log`` in a study's folder.
-
-    Yields:
-        What was the standard output.
-    """
-    terminal, words = sys.stdout, folder / "logs" / "ray.log"
-    words.parent.mkdir(parents=True, exist_ok=True)
-    with words.open("a", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
-        yield terminal
-
-
-def refuse_silence(address: str) -> None:
-    """Say that nobody answers at HOST:PORT; Ray itself would try for minutes.
-
-    Raises:
-        ValueError: if nobody does.
-    """
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal():
-        return  # auto, or a form that Ray reads itself
-    try:
-        socket.create_connection((host, int(port)), timeout=ANSWER).close()
-    except (OSError, OverflowError) as error:
-        raise ValueError(
-            f"no Ray cluster answers at {address} ({error}); start one with `ray start --head`, or leave --ray-address "
-            "away"
-        ) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +68,11 @@ class Conductor:
             KeyboardInterrupt: when told to end (see `recipes.interrupt.stopping_at_once`). All processes that compute
                 end at once: checkpoints are made for that.
         """
-        self._wait_for(self._submit())
+        running = self._submit()
+        if running:
+            words = f"{len(running)} cell(s) wait for their processes, which take 10 to 30 s to load PyTorch"
+            print(words, file=self._terminal, flush=True)
+        self._wait_for(running)
         return self.ledger.in_state("failed")
 
     def _submit(self) -> dict[ray.ObjectRef, Cell]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 
 import pytest
@@ -14,12 +15,12 @@ def cluster() -> Iterator:
     One for all tests: it takes as long to begin as what is computed on it.
     """
     ray_cluster = pytest.importorskip("ray.cluster_utils")
-    from recipes.studies.conduct import ray_running
+    from recipes.studies.cluster import ray_running
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("RAY_worker_niceness", "0")  # or a machine with other work lets the tests wait
         nodes = ray_cluster.Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
         nodes.add_node(num_cpus=2)
-    with ray_running(address=nodes.address):
+    with ray_running(io.StringIO(), address=nodes.address):
         yield nodes
     nodes.shutdown()

@@ -24,7 +24,9 @@ from coim import HopperMorph
 from recipes.experiment import run as run_recipe
 from recipes.results import design_columns
 from recipes.soak import differences
-from recipes.studies.conduct import Conductor, Resources, lacking, without_words_of_ray
+from recipes.studies import cluster as cluster_module
+from recipes.studies.cluster import LONGEST, SOCKET, SOCKETS, short_folder, token_without_file, without_words_of_ray
+from recipes.studies.conduct import Conductor, Resources, lacking
 from recipes.studies.definition import Block, Study, to_json
 from recipes.studies.ledger import Ledger, read_ledger
 from recipes.study import entry
@@ -82,7 +84,8 @@ def test_every_cell_of_a_study_is_an_ordinary_run_and_pairs_share_their_first_de
     assert all(a[name] == b[name] for a, b in list(zip(*designs))[:5] for name in XI)
     assert read(none / "evaluations.csv")[0]["return"] == read(oracle / "evaluations.csv")[0]["return"]
     assert (none / "report.html").exists()
-    lines = capsys.readouterr().out.splitlines()
+    waiting, *lines = capsys.readouterr().out.splitlines()
+    assert waiting.startswith("2 cell(s) wait for their processes")
     assert sorted(line.split()[2] for line in lines) == ["finished", "finished", "started", "started"]
     assert lines[-1].endswith("2 of 2")
     assert conduct(tmp_path, study(arms=("none", "oracle")))[0] == []  # nothing is left to do
@@ -105,7 +108,7 @@ def test_a_cell_whose_process_is_killed_goes_on_from_its_checkpoint_to_the_same_
     assert (ledger.entries[cell].state, ledger.entries[cell].tries) == ("finished", 2)
     assert differences(peace, tmp_path / "killed" / "cells" / cell) == []
     out, err = capsys.readouterr()
-    assert [line.split(maxsplit=2)[2].split(" in ")[0] for line in out.splitlines()] == [
+    assert [line.split(maxsplit=2)[2].split(" in ")[0] for line in out.splitlines()[1:]] == [
         "started",
         "goes on (try 2)",
         "finished",
@@ -160,13 +163,14 @@ def test_a_study_that_is_told_to_end_stops_at_once_and_goes_on_by_the_line_it_pr
     folder = tmp_path / "my study"
     arguments = [str(tmp_path / "my.json"), "--out", str(folder), "--workers", "1"]
     temporary = {"TMPDIR": tempfile.mkdtemp(dir="/tmp")}
+    nowhere = {"HOME": "/proc", "MPLCONFIGDIR": str(tmp_path)}  # nothing can be written at home
     begun = time.monotonic()
     first = subprocess.Popen(
         [sys.executable, "-m", "recipes.study", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | temporary | {"RAY_worker_niceness": "0"},
+        env=os.environ | temporary | nowhere | {"RAY_worker_niceness": "0"},
     )
 
     def refuse_another_and_stop(pid: int) -> None:
@@ -183,16 +187,52 @@ def test_a_study_that_is_told_to_end_stops_at_once_and_goes_on_by_the_line_it_pr
     assert first.returncode == 128 + signal.SIGTERM
     assert not Path(f"/proc/{pid}").exists()
     assert out.splitlines()[0] == f"test: 2 of 2 cells to compute -> {folder}"
-    assert [line.split(maxsplit=1)[1] for line in out.splitlines()[1:]] == [f"{cells[0]}  started"]
+    assert out.splitlines()[1].startswith("starting Ray on this machine")
+    assert out.splitlines()[2].startswith("2 cell(s) wait for their processes")
+    assert [line.split(maxsplit=1)[1] for line in out.splitlines()[3:]] == [f"{cells[0]}  started"]
     assert [(row.state, row.tries) for row in read_ledger(folder / "ledger.csv")] == [("waiting", 1), ("waiting", 0)]
     told = shlex.split(err.strip())
     assert told[:6] == ["stopped", "by", "SIGTERM;", "to", "go", "on:"]
     assert told[6:] == ["python", "-m", "recipes.study", *arguments]
     assert list(Path(temporary["TMPDIR"]).iterdir()) == []
-    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())  # on the cluster there is
+    monkeypatch.setattr(
+        "recipes.study.ray_running", lambda *_, **__: contextlib.nullcontext()
+    )  # on the cluster there is
     entry(told[9:])
     assert [(row.state, row.tries) for row in read_ledger(folder / "ledger.csv")] == [("finished", 2), ("finished", 1)]
     assert [len(read(folder / "cells" / cell / "evaluations.csv")) for cell in cells] == [7, 1]
+
+
+def test_paths_of_sockets_are_short_enough_everywhere(cluster: Any) -> None:
+    node = cluster.head_node
+    added = len(node.plasma_store_socket_name) - len(node.get_temp_dir_path())
+    assert added + len("/ray-12345678") <= SOCKETS
+    assert LONGEST + SOCKETS <= SOCKET
+
+
+def test_a_long_folder_for_temporary_files_is_passed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/tmp")
+    assert short_folder() == "/tmp"
+    job = tmp_path / ("x" * LONGEST)
+    job.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(job))
+    assert short_folder() == "/tmp"
+    monkeypatch.setattr(cluster_module, "SHORT", ("/tmp/" + "y" * LONGEST, "/nowhere"))
+    with pytest.raises(OSError, match=rf"at most {LONGEST} bytes; TMPDIR is {job}, .* set TMPDIR to a shorter one"):
+        short_folder()
+
+
+def test_a_token_is_in_the_environment_while_it_is_needed_and_one_that_was_set_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    with token_without_file():
+        assert len(os.environ["RAY_AUTH_TOKEN"]) == 64
+    assert "RAY_AUTH_TOKEN" not in os.environ
+    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", "/mine")
+    with token_without_file():
+        assert "RAY_AUTH_TOKEN" not in os.environ
 
 
 def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
@@ -202,7 +242,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
         conductor.ledger.note("hopper-forward-known-0", "failed", message="ValueError: no luck")
         return ["hopper-forward-known-0"]
 
-    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr("recipes.study.ray_running", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr("recipes.studies.conduct.lacking", lambda _: "")
     monkeypatch.setattr(Conductor, "conduct", fail)
     with pytest.raises(SystemExit) as ended:
@@ -216,7 +256,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
 
 @pytest.mark.usefixtures("cluster")
 def test_what_no_node_has_is_said_instead_of_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recipes.study.ray_running", lambda **_: contextlib.nullcontext())
+    monkeypatch.setattr("recipes.study.ray_running", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr("recipes.study.checked_device", torch.device)  # as if this machine had a GPU
     with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
         entry(["smoke", "--out", str(tmp_path / "s"), "--gpus", "0.5"])
