@@ -97,7 +97,7 @@ class Divergence:
 
     def _sound(self, metrics: Mapping[str, Tensor]) -> Tensor:
         """Which runs hold finite numbers alone, ``[K]`` bool on the CPU."""
-        sound = torch.ones(self.num_runs, dtype=torch.bool)
+        sound = torch.ones(self.num_runs, dtype=torch.bool, device="cpu")
         for value in metrics.values():
             sound &= value.isfinite().cpu()
         moments = [moment for learner in self.learners for moment in learner.moments_by_run()]

@@ -16,17 +16,17 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 
 from coim.compiling import compiled
 from coim.continuation import check_sizes, load_moments
-from coim.learner import Precision, by_run, moments_by_run, share_storage, views
+from coim.flat import FlatUpdates, by_run, moments_by_run, on_device, share_storage, views
+from coim.learner import Precision
 from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
-from coim.objectives.dynamics import EnsembleNLLLoss
+from coim.objectives.dynamics import EnsembleNLLLoss, check_one_step
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Network
-from coim.objectives.runs import check_batch
+from coim.objectives.runs import by_update, check_batch
 
 
 class DynamicsLearner:
@@ -43,7 +43,8 @@ class DynamicsLearner:
 
     Attributes:
         loss: the `EnsembleNLLLoss` over the same parameters, for those who want its value or its gradients.
-        optimiser: Adam over the flat buffer of all weights.
+        optimiser: Adam over the flat buffer of all weights.  Its settings may be changed at any time; the next update
+            follows.
 
     Raises:
         ValueError: if ``precision`` is unknown or ``num_runs`` is not the ensemble's.
@@ -78,23 +79,19 @@ class DynamicsLearner:
         self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
         self._lay_out(list(ensemble.network.parameters()), precision)
         self._find = compiled(dynamics_gradients, self._weights.device) if compile else dynamics_gradients
-        on_gpu = self._weights.device.type == "cuda"
-        self.optimiser = torch.optim.Adam(
-            [self._weights], lr=lr, weight_decay=weight_decay, fused=True, capturable=on_gpu
-        )
-        self._step = CudaGraphModule(self._update_once) if on_gpu else self._update_once
+        self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
+        self.optimiser = self._updates.optimiser
 
     def observe(self, rows: TensorDictBase) -> None:
         """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets.
 
         Args:
-            rows: ``[*B, (K)]``, each row once in its life.
+            rows: ``[*B, (K)]`` on any device, each row once in its life.
 
         Raises:
-            ValueError: if there are no rows or the run axis is missing.
+            ValueError: if there are no rows, the run axis is missing, or a next observation is several steps ahead.
         """
-        check_batch(rows.batch_size, self.num_runs)
-        self.ensemble.update_statistics(rows)
+        self.ensemble.update_statistics(self._taken(rows))
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that coming updates depend on: weights, moments, statistics. Tensors are not copied."""
@@ -132,11 +129,15 @@ class DynamicsLearner:
         """Squared error of the members' means, in units of the variance of one-step changes in these rows.
 
         Args:
-            rows: ``[R, K]``, at least two of them.
+            rows: ``[*B, (K)]`` on any device, at least two for each run.
 
         Returns:
             Mean over rows, members and observation entries, ``[K]``; predicting "nothing changes" scores about 1.
+
+        Raises:
+            ValueError: as `observe` does.
         """
+        rows = self._taken(rows).reshape(-1, self.num_runs or 1)
         observation, following = rows["observation"], rows["next", "observation"]
         means, _ = self.ensemble.moments(observation, rows["action"], rows["design"])
         error = self.ensemble.wrapped(means - following.unsqueeze(-2)).square().mean((0, -2))
@@ -148,21 +149,27 @@ class DynamicsLearner:
         """One optimiser step per batch.
 
         Args:
-            batches: rows in the transition schema, ``[U, B]`` or ``[U, B, K]``; left untouched.
+            batches: rows in the transition schema, on any device, shaped as for `coim.SACLearner.update`: ``[B, K]`` is
+                one batch, ``[U, B, K]`` one for each of U updates; left untouched.
 
         Returns:
             ``loss_dynamics`` of each run, the sum over its members, ``[K]``: means over the U updates.
 
         Raises:
-            ValueError: if there are no rows or the run axis is missing.
+            ValueError: if the rows have another shape, there are none, or a next observation is several steps ahead.
             RuntimeError: if the ensemble's weights no longer lie in the flat buffer.
         """
-        check_batch(batches.batch_size, self.num_runs)
+        batches = by_update(batches, self.num_runs)
         if next(self.ensemble.network.parameters()).data_ptr() != self._weights.data_ptr():
             raise RuntimeError("the ensemble was moved after its learner was made; make the learner last")
-        inputs, targets = self._arrange(batches)
-        mean = torch.stack([self._step(x, target) for x, target in zip(inputs, targets)]).mean(0)
+        mean = self._updates.mean(zip(*self._arrange(self._taken(batches))))
         return TensorDict({"loss_dynamics": mean}, mean.shape)
+
+    def _taken(self, rows: TensorDictBase) -> TensorDictBase:
+        """Rows on the device of the ensemble, after they were found to be what it learns from."""
+        check_batch(rows.batch_size, self.num_runs)
+        check_one_step(rows, self.loss.tensor_keys.steps_to_next_obs)
+        return on_device(rows, self._weights.device)
 
     def _update_once(self, x: Tensor, target: Tensor) -> Tensor:
         """One update with a batch, ``[K, B, F]`` and ``[K, B, S]``; its losses, ``[K]``."""
@@ -175,7 +182,7 @@ class DynamicsLearner:
     def _lay_out(self, parameters: list[nn.Parameter], precision: Precision) -> None:
         """Move all weights into one flat buffer, and cut it and that of the gradients into networks."""
         self._weights = nn.Parameter(share_storage(parameters))
-        self._weights.grad = torch.zeros_like(self._weights)
+        self._weights.grad = torch.zeros_like(self._weights.detach())
         # Products read these: the weights themselves, or a copy in bfloat16 that every update renews.
         self._read_weights = self._weights.detach()
         if precision == "bfloat16":

@@ -17,19 +17,20 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from coim.compiling import compiled
 from coim.continuation import check_sizes, load_moments
+from coim.flat import FlatUpdates, by_run, captures, moments_by_run, on_device, save_alone, share_storage, views
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
 from coim.models.scaling import InputScaling
 from coim.models.stacked import StackedMLP
+from coim.objectives.dynamics import check_one_step
 from coim.objectives.functional import mixing_weights
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
-from coim.objectives.runs import check_batch
+from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
 
@@ -55,7 +56,8 @@ class SACLearner:
 
     Attributes:
         loss: the `CoImSACLoss` over the same parameters, for those who want its value or its gradients.
-        optimiser: Adam over the flat buffer of all weights.
+        optimiser: Adam over the flat buffer of all weights.  Its settings, ``tau``, ``loss.alpha`` and ``loss.gamma``
+            may be changed at any time; the next update follows.
 
     Raises:
         ValueError: if ``precision`` is unknown, a number is out of its range, ``num_runs`` is not the networks', or
@@ -104,10 +106,14 @@ class SACLearner:
         SoftUpdate(self.loss, tau=tau)  # starts the targets at the critics, and tells TorchRL that they are cared for
         self.tau, self.num_runs = tau, num_runs
         self._lay_out(policy.network.mlp, qvalue.module.mlp, precision)
-        on_gpu = self._weights.device.type == "cuda"
-        self.optimiser = torch.optim.Adam([self._weights], lr=lr, fused=True, capturable=on_gpu)
-        self._find = compiled(sac_gradients, self._weights.device) if compile else sac_gradients
-        self._step = CudaGraphModule(self._update_once) if on_gpu else self._update_once
+        device = self._weights.device
+        self._find = compiled(sac_gradients, device) if compile else sac_gradients
+        # A number would become a constant of what is compiled or captured. That reads these, renewed before updates;
+        # torch.compile takes a float64 scalar without a dimension for such a number, and fails.
+        read = ("alpha", "gamma", "tau") if captures(device) else ("alpha", "gamma") if compile else ()
+        self._read_numbers = {name: self._weights.detach().new_empty(1) for name in read}
+        self._updates = FlatUpdates(self._update_once, self._weights, lr=lr)
+        self.optimiser = self._updates.optimiser
         self.rng = torch.Generator(self._weights.device).manual_seed(seed)
 
     @torch.no_grad()
@@ -159,21 +165,27 @@ class SACLearner:
         """One optimiser step and one target update per batch.
 
         Args:
-            batches: rows in the transition schema, ``[U, B]`` or ``[U, B, K]``; left untouched.
+            batches: rows in the transition schema, on any device; left untouched.  ``[B, K]`` is one batch and
+                ``[U, B, K]`` one for each of U updates.  A single run may leave its axis away: ``[B]``, and with
+                ``num_runs=None`` ``[U, B]``, batches of two rows or more.
 
         Returns:
             ``loss_actor``, ``loss_qvalue`` and ``entropy`` of each run, ``[K]``: means over the U updates.
 
         Raises:
-            ValueError: if there are no rows or the run axis is missing.
+            ValueError: if the rows have another shape, there are none, or they have what only the loss knows: several
+                steps to the next observation, importance weights.
             RuntimeError: if the networks' weights no longer lie in the flat buffer.
         """
-        check_batch(batches.batch_size, self.num_runs)
+        batches = by_update(batches, self.num_runs)
+        self._check_keys(batches)
         lies_at = {parameter.data_ptr() for parameter in self._parameters()}
         if lies_at != {view.data_ptr() for view in views(self._weights, self._parameters())}:
             raise RuntimeError("the networks were moved after their learner was made; make the learner last")
-        rows = self._arrange(batches)
-        means = torch.stack([self._step(*(x[u] for x in rows)) for u in range(len(batches))]).mean(0)
+        for name, tensor in self._read_numbers.items():
+            tensor.fill_(self._numbers()[name])
+        rows = self._arrange(on_device(batches, self._weights.device))
+        means = self._updates.mean([x[u] for x in rows] for u in range(len(batches)))
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
 
     def _update_once(self, *rows: Tensor) -> Tensor:
@@ -181,20 +193,34 @@ class SACLearner:
         if self._read_weights.dtype != self._weights.dtype:
             self._read_weights.copy_(self._weights)
             self._read_targets.copy_(self._targets)
+        numbers = self._numbers() | self._read_numbers
         found = [
             self._find(
                 *networks,
                 Batch(*(x[run] for x in rows)) if self._one_by_one else Batch(*rows),
-                alpha=self.loss.alpha,
-                gamma=self.loss.gamma,
+                alpha=numbers["alpha"],
+                gamma=numbers["gamma"],
                 log_scale_range=LOG_SCALE_RANGE,
             )
             for run, networks in enumerate(self._networks)
         ]
         self._collect(found)
         self.optimiser.step()
-        self._targets.lerp_(self._weights[-len(self._targets) :], self.tau)
+        self._targets.lerp_(self._weights[-len(self._targets) :], numbers["tau"])
         return torch.stack([torch.stack([g.loss_actor, g.loss_qvalue, g.entropy]) for g in found], -1).reshape(3, -1)
+
+    def _numbers(self) -> dict[str, Any]:
+        return {"alpha": self.loss.alpha, "gamma": self.loss.gamma, "tau": self.tau}
+
+    def _check_keys(self, batches: TensorDictBase) -> None:
+        """Refuse what `CoImSACLoss` takes into account and the gradients here do not."""
+        keys = self.loss.tensor_keys
+        check_one_step(batches, keys.steps_to_next_obs)
+        if keys.priority_weight in batches.keys(True):
+            raise ValueError(
+                f"rows with {keys.priority_weight!r}: SACLearner has no importance weights; train with CoImSACLoss, or "
+                "exclude() the key to count all rows alike"
+            )
 
     # -- one flat buffer, and views of it ------------------------------------------------------------------------------
 
@@ -209,6 +235,8 @@ class SACLearner:
         keys = [tuple(name.split(".")) for name, _ in self.qvalue.named_parameters()]
         targets = [self.loss.target_qvalue_params.get(key) for key in keys]
         self._weights = nn.Parameter(share_storage(own))
+        for network in (policy, critics):
+            save_alone(network)
         self._weights.grad = torch.zeros_like(self._weights.detach())
         self._targets = share_storage(targets)
         # Products read these: the weights themselves, or copies in bfloat16 that every update renews.
@@ -289,34 +317,6 @@ def same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
     if one is None or other is None:
         return one is other
     return all(torch.equal(a, b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
-
-
-def share_storage(tensors: Sequence[Tensor]) -> Tensor:
-    """Move tensors into one flat buffer, in place: each becomes a view of what is returned."""
-    flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
-    for tensor, view in zip(tensors, views(flat, tensors)):
-        tensor.data = view
-    return flat
-
-
-def views(flat: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Consecutive parts of a flat buffer in the shapes of some tensors."""
-    parts = flat[: sum(tensor.numel() for tensor in tensors)].split([tensor.numel() for tensor in tensors])
-    return [part.view(tensor.shape) for part, tensor in zip(parts, tensors)]
-
-
-def by_run(flat: Tensor, tensors: Sequence[Tensor], num_runs: int | None) -> list[Tensor]:
-    """Consecutive parts of a flat buffer in the shapes of some tensors, with a run axis even where there is but one."""
-    found = views(flat.detach(), tensors)
-    return found if num_runs is not None else [part.unsqueeze(0) for part in found]
-
-
-def moments_by_run(
-    optimiser: torch.optim.Optimizer, weights: nn.Parameter, tensors: Sequence[Tensor], num_runs: int | None
-) -> list[Tensor]:
-    """Moments of an optimiser of one flat buffer, as :func:`by_run` has the buffer itself."""
-    moments = [moment for moment in optimiser.state.get(weights, {}).values() if moment.ndim]
-    return [part for moment in moments for part in by_run(moment, tensors, num_runs)]
 
 
 def _network(layers: Sequence[Tensor], index: Any) -> Network:

@@ -23,7 +23,7 @@ from coim.continuation import check_sizes
 from coim.envs import BODIES, MorphEnv
 from coim.episode import run_episode
 from coim.events import Kind
-from coim.learner import views
+from coim.flat import views
 from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, select_run
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)

@@ -14,7 +14,7 @@ from test_coadaptation import STEPS, small
 from torch import Tensor
 
 from coim import CoAdaptation, DesignChosen, DesignDone, EpisodeDone, Event, GradientSearch
-from coim.divergence import LARGEST_WEIGHT
+from coim.divergence import LARGEST_WEIGHT, Divergence
 from coim.events import running
 
 Poison = Callable[[Any, TensorDict], None]
@@ -184,3 +184,21 @@ def test_a_run_that_diverges_by_itself_is_found() -> None:
     events = list(algorithm)
     assert [type(event) for event in events] == [DesignChosen, EpisodeDone, DesignDone]
     assert events[-1].diverged == {0: (0, 0)}
+
+
+def test_what_diverged_is_found_whatever_torchs_default_device_is() -> None:
+    class Learner:
+        def weights_by_run(self) -> list[Tensor]:
+            return [kept]
+
+        def moments_by_run(self) -> list[Tensor]:
+            return []
+
+    kept = torch.ones(2, 3)
+    with torch.device("meta"):
+        divergence = Divergence(2, [Learner()])
+        divergence.remember()
+        kept[1] = torch.inf
+        divergence.contain({"loss": torch.zeros(2, device="cpu")}, (0, 0))
+    assert divergence.places == {1: (0, 0)}
+    assert kept.tolist() == [[1.0] * 3] * 2

@@ -126,6 +126,33 @@ def test_the_input_is_left_untouched(make_rows: Rows) -> None:
     assert (batches == before).all()
 
 
+@pytest.mark.parametrize(
+    ("num_runs", "batch"), [(None, (12,)), (None, (12, 1)), (1, (12,)), (1, (12, 1)), (2, (12, 2))]
+)
+def test_what_a_buffer_samples_is_one_update(make_rows: Rows, num_runs: int | None, batch: tuple[int, ...]) -> None:
+    rows = make_rows(*batch)
+    flat, explicit = (
+        DynamicsLearner(ensemble_on(rows.reshape(12, num_runs or 1), num_runs=num_runs), num_runs=num_runs)
+        for _ in range(2)
+    )
+    flat.optimiser.zero_grad()
+    metrics, expected = flat.update(rows), explicit.update(rows.reshape(1, 12, num_runs or 1))
+    assert (metrics == expected).all()
+    assert [int(moments["step"]) for moments in flat.optimiser.state.values()] == [1]
+    assert torch.equal(flat.state_dict()["weights"], explicit.state_dict()["weights"])
+
+
+@pytest.mark.parametrize("name", ["update", "observe", "error"])
+def test_a_change_over_several_steps_is_refused(make_rows: Rows, name: str) -> None:
+    rows = make_rows(8, 1)
+    learner = DynamicsLearner(ensemble_on(rows))
+    rows["steps_to_next_obs"] = torch.ones(8, 1, 1, dtype=torch.int64)
+    getattr(learner, name)(rows)
+    rows["steps_to_next_obs"][3] = 5
+    with pytest.raises(ValueError, match="'steps_to_next_obs' is up to 5, 1 is needed here"):
+        getattr(learner, name)(rows)
+
+
 def test_bad_input_is_named(make_rows: Rows) -> None:
     batches = make_rows(2, 8)
     with pytest.raises(ValueError, match="precision='float16' is unknown; choose 'float32' or 'bfloat16'"):
@@ -169,13 +196,14 @@ def test_predicting_no_change_scores_one() -> None:
         def wrapped(self, x: torch.Tensor) -> torch.Tensor:
             return x
 
-    learner = DynamicsLearner.__new__(DynamicsLearner)
+    learner = DynamicsLearner(GaussianEnsemble.for_env(ToyEnv(), num_cells=(8,)))
     learner.ensemble = Still()  # type: ignore[assignment]
     observation = torch.zeros(1000, 1, 3)
     following = torch.randn(1000, 1, 3, generator=torch.Generator().manual_seed(0))
     rows = TensorDict({"observation": observation, "action": observation, "design": observation}, [1000, 1])
     rows["next"] = TensorDict({"observation": following}, [1000, 1])
     torch.testing.assert_close(learner.error(rows), torch.ones(1), rtol=0, atol=0.01)
+    torch.testing.assert_close(learner.error(rows.reshape(10, 100)), learner.error(rows))
 
 
 @pytest.mark.gpu

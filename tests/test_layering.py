@@ -20,6 +20,7 @@ RANKS = {name: 0 for name in ("objectives.functional", "products", "angles", "ra
 RANKS |= {name: 1 for name in ("envs", "models", "objectives", "designs", "buffers", "batches", "compiling")}
 RANKS |= {name: 2 for name in ("learner", "dynamics_learner", "episode", "imagination", "events", "agreement")}
 RANKS |= {name: 2 for name in ("continuation", "coadaptation", "design_loop", "divergence", "checkpoints", "saved_run")}
+RANKS["flat"] = 2
 RECIPES_ONLY = "recipes/"
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
 HOMES |= {name: RECIPES_ONLY for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray")}

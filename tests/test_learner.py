@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from copy import deepcopy
 
@@ -77,21 +78,26 @@ def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(make_rows: Rows) -
 
 
 def test_compiled_float32_updates_of_a_fleet_equal_the_plain_ones(make_rows: Rows) -> None:
+    """Also after alpha, gamma, tau and the learning rate were changed: none is a constant of what was compiled."""
+
     def learner(compile: bool) -> SACLearner:
         torch.manual_seed(0)
         policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=3)
-        return SACLearner(
-            policy, make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=3), num_runs=3, compile=compile
-        )  # fmt: skip
+        qvalue = make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=3)
+        return SACLearner(policy, qvalue, num_runs=3, compile=compile)
 
-    batches = make_rows(20, 16, 3, dtype=torch.float32)
     plain, quick = learner(False), learner(True)
-    metrics, expected = quick.update(batches), plain.update(batches)
-    for key, value in expected.items():
-        torch.testing.assert_close(metrics[key], value, rtol=1e-5, atol=1e-6)
-    for key, value in weights(plain).items():
-        limit = 1e-5 * float(value.abs().max())
-        torch.testing.assert_close(weights(quick)[key], value, rtol=0, atol=limit)
+    for seed in (0, 1):
+        batches = make_rows(20, 16, 3, dtype=torch.float32, seed=seed)
+        metrics, expected = quick.update(batches), plain.update(batches)
+        for key, value in expected.items():
+            torch.testing.assert_close(metrics[key], value, rtol=1e-5, atol=1e-6)
+        for key, value in weights(plain).items():
+            limit = 1e-5 * float(value.abs().max())
+            torch.testing.assert_close(weights(quick)[key], value, rtol=0, atol=limit)
+        for subject in (plain, quick):
+            subject.loss.alpha, subject.loss.gamma, subject.tau = 0.5, 0.5, 0.25
+            subject.optimiser.param_groups[0]["lr"] = 1e-3
 
 
 def test_a_fleet_of_one_learns_as_a_single_run(make_rows: Rows) -> None:
@@ -122,6 +128,62 @@ def test_rows_of_one_run_never_count_as_anothers(
     with pytest.raises(ValueError, match=message):
         learner.update(make_rows(*batch))
     assert all(torch.equal(value, before[key]) for key, value in weights(learner).items())
+
+
+@pytest.mark.parametrize(
+    ("num_runs", "batch"), [(None, (12,)), (None, (12, 1)), (1, (12,)), (1, (12, 1)), (2, (12, 2))]
+)
+def test_what_a_buffer_samples_is_one_update(make_rows: Rows, num_runs: int | None, batch: tuple[int, ...]) -> None:
+    flat, explicit = sac_learner(num_runs), sac_learner(num_runs)
+    rows = make_rows(*batch)
+    metrics, expected = flat.update(rows), explicit.update(rows.reshape(1, 12, num_runs or 1))
+    assert (metrics == expected).all()
+    assert [int(moments["step"]) for moments in flat.optimiser.state.values()] == [1]
+    assert all(torch.equal(value, weights(explicit)[key]) for key, value in weights(flat).items())
+
+
+@pytest.mark.parametrize("set_to_none", [True, False])
+def test_forgetting_the_gradients_changes_nothing(make_rows: Rows, set_to_none: bool) -> None:
+    learner, other = sac_learner(), sac_learner()
+    for subject in (learner, other):
+        subject.update(make_rows(2, 8))
+        if subject is learner:
+            subject.optimiser.zero_grad(set_to_none=set_to_none)
+        subject.update(make_rows(2, 8, seed=1))
+    assert all(torch.equal(value, weights(other)[key]) for key, value in weights(learner).items())
+
+
+def test_rows_that_only_the_loss_understands_are_refused(make_rows: Rows) -> None:
+    learner, rows = sac_learner(), make_rows(8)
+    rows["steps_to_next_obs"] = torch.ones(8, 1, dtype=torch.int64)
+    learner.update(rows)
+    rows["steps_to_next_obs"][3] = 5
+    with pytest.raises(ValueError, match=r"'steps_to_next_obs' is up to 5, 1 is needed here.*CoImSACLoss"):
+        learner.update(rows)
+    with pytest.raises(ValueError, match=r"'priority_weight': .* train with CoImSACLoss, or exclude\(\) the key"):
+        learner.update(make_rows(8).set("priority_weight", torch.ones(8)))
+
+
+@pytest.mark.parametrize("name", ["policy", "qvalue"])
+def test_a_saved_network_is_that_network_alone(make_rows: Rows, name: str) -> None:
+    def saved(state: dict[str, torch.Tensor]) -> int:
+        file = io.BytesIO()
+        torch.save(state, file)
+        return len(file.getvalue())
+
+    env = ToyEnv()
+    networks = {"policy": make_policy(env), "qvalue": make_qvalue(env)}
+    before = saved(networks[name].state_dict())
+    learner = SACLearner(**networks)
+    network = getattr(learner, name)
+    assert saved(network.state_dict()) < 1.01 * before
+    assert saved(deepcopy(network).state_dict()) < 1.01 * before
+    for key, value in network.state_dict(keep_vars=True).items():
+        assert torch.equal(value, network.state_dict()[key])
+    start = {key: value.clone() for key, value in network.state_dict().items()}
+    learner.update(make_rows(2, 8, dtype=torch.float32))
+    network.load_state_dict(start)
+    learner.update(make_rows(2, 8, dtype=torch.float32))  # they still lie in the flat buffer
 
 
 @pytest.mark.parametrize("which", ["policy", "qvalue"])

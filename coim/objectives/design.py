@@ -8,6 +8,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +20,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from .functional import design_value
+from .moving import move
 from .runs import check_num_runs
 
 # Evaluated at a time: on a CPU what keeps the activations in the cache of a core, elsewhere what fits into memory.
@@ -105,7 +107,7 @@ class DesignValue(LossModule):
         check_num_runs(None, policy, qvalue)
         self.convert_to_functional(policy, "policy")
         self.convert_to_functional(qvalue, "qvalue")
-        self.start_states = start_states.select(*policy.in_keys, *qvalue.in_keys, strict=False)
+        self.start_states = start_states.select(*policy.in_keys, *qvalue.in_keys, strict=False).detach()
         self.chunk_size, self.precision = chunk_size, precision
         broken = [key for key, value in self.start_states.items(True, True) if not value.isfinite().all()]
         if broken:
@@ -118,6 +120,13 @@ class DesignValue(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """There is no value estimator."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor]) -> DesignValue:
+        """Move to a device or dtype; networks and start states come along."""
+        with move(fn, (self.policy, self.policy_params), (self.qvalue, self.qvalue_params)):
+            super()._apply(fn)
+        self.start_states = self.start_states.apply(fn, device=None)
+        return self
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from .functional import gaussian_nll
+from .moving import move
 from .runs import check_batch, check_num_runs, split_runs
 
 
@@ -34,7 +35,8 @@ class EnsembleNLLLoss(LossModule):
         num_runs: ``K``, the last batch dimension; None averages over the whole batch.
 
     Raises:
-        ValueError: if ``num_runs`` is not that of the ensemble.
+        ValueError: if ``num_runs`` is not that of the ensemble.  When called: if a next observation is more than one
+            step ahead (``steps_to_next_obs``).
 
     Note:
         All members see the same rows.  Chua et al. [3] draw a bootstrap of the data for each member instead; here
@@ -58,11 +60,13 @@ class EnsembleNLLLoss(LossModule):
             observation: state; its successor is read at ``("next", observation)``.
             mean: written by the ensemble.
             log_var: written by the ensemble.
+            steps_to_next_obs: how many steps ahead the next observation is; one where it is absent.
         """
 
         observation: NestedKey = "observation"
         mean: NestedKey = "mean"
         log_var: NestedKey = "log_var"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -88,8 +92,8 @@ class EnsembleNLLLoss(LossModule):
 
     def _apply(self, fn: Callable[[Tensor], Tensor]) -> EnsembleNLLLoss:
         """Move to a device or dtype, and the ensemble along: its running statistics stay those of the loss."""
-        super()._apply(fn)
-        self.ensemble_params.to_module(self.ensemble)
+        with move(fn, (self.ensemble, self.ensemble_params)):
+            super()._apply(fn)
         return self
 
     @dispatch
@@ -100,8 +104,10 @@ class EnsembleNLLLoss(LossModule):
             tensordict: ``[*B, (K)]`` rows of Replay_Pop; left as it is.
 
         Returns:
-            A TensorDict with the scalar ``loss_dynamics``.
+            A TensorDict with the scalar ``loss_dynamics``, with gradient for the ensemble alone.
         """
+        tensordict = tensordict.detach()
+        check_one_step(tensordict, self.tensor_keys.steps_to_next_obs)
         observation = tensordict[self.tensor_keys.observation]
         check_batch(observation.shape[:-1], self.num_runs)
         next_observation = tensordict[unravel_key(("next", self.tensor_keys.observation))]
@@ -111,3 +117,21 @@ class EnsembleNLLLoss(LossModule):
         mean, log_var = out[self.tensor_keys.mean], out[self.tensor_keys.log_var]
         nll = gaussian_nll(mean, log_var, target.unsqueeze(-2)).sum(-1)  # members
         return TensorDict({"loss_dynamics": split_runs(nll, self.num_runs).mean(0).sum()})
+
+
+def check_one_step(rows: TensorDictBase, key: NestedKey) -> None:
+    """Refuse rows of which some next observation is more than one step ahead.
+
+    Args:
+        rows: ``[*B]``.
+        key: where the number of steps is; without that entry all are one.
+
+    Raises:
+        ValueError: naming the greatest number.
+    """
+    steps = rows.get(key, None)
+    if steps is not None and bool((steps != 1).any()):
+        raise ValueError(
+            f"{key!r} is up to {int(steps.max())}, 1 is needed here: train on rows of single steps, "
+            "without MultiStepTransform (CoImSACLoss takes n-step rows)"
+        )

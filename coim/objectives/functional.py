@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 
-def soft_value(q: Tensor, log_prob: Tensor, alpha: float) -> Tensor:
+def soft_value(q: Tensor, log_prob: Tensor, alpha: float | Tensor) -> Tensor:
     r"""State value under the target critics, :math:`V_{\bar\theta}` of Eq. 3.
 
     Args:
@@ -32,14 +32,14 @@ def soft_value(q: Tensor, log_prob: Tensor, alpha: float) -> Tensor:
     return q.amin(-1) - alpha * log_prob
 
 
-def bellman_target(reward: Tensor, terminated: Tensor, value: Tensor, gamma: float) -> Tensor:
+def bellman_target(reward: Tensor, terminated: Tensor, value: Tensor, gamma: float | Tensor) -> Tensor:
     r"""Target of the critics, :math:`r + \gamma V_{\bar\theta}(s_{t+1}, \xi)` of Eq. 3.
 
     Args:
         reward: ``[*B]``.
         terminated: bool, ``[*B]``.  Only these rows have no future; a time limit is not one of them.
         value: of the next state, ``[*B]``.
-        gamma: discount, in [0, 1].
+        gamma: discount, in [0, 1]; where the next state is n steps ahead, ``[*B]`` with the n-th power.
 
     Returns:
         ``[*B]``.
@@ -60,7 +60,7 @@ def qvalue_loss(q: Tensor, target: Tensor) -> Tensor:
     return (q - target.unsqueeze(-1)).square().sum(-1) / 2
 
 
-def policy_loss(q: Tensor, log_prob: Tensor, alpha: float) -> Tensor:
+def policy_loss(q: Tensor, log_prob: Tensor, alpha: float | Tensor) -> Tensor:
     """One row of J_pi, Eq. 4, with the minimum of the critics as Q.
 
     Args:
@@ -94,7 +94,13 @@ def tanh_normal(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tens
     return preimage.tanh(), (log_normal - log_slope).sum(-1)
 
 
-def mixing_weights(imagined: Tensor, mix: Literal["batch", "sum"], *, dtype: torch.dtype | None = None) -> Tensor:
+def mixing_weights(
+    imagined: Tensor,
+    mix: Literal["batch", "sum"],
+    *,
+    importance: Tensor | None = None,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
     r"""Weight of each row in Eq. 7-8: their expectations are ``(weights * rows).sum(0)``.
 
     ``"batch"`` is the mixture of Sec. 5, one mean over real and imagined rows; ``"sum"`` is the printed sum of two
@@ -103,11 +109,18 @@ def mixing_weights(imagined: Tensor, mix: Literal["batch", "sum"], *, dtype: tor
     Args:
         imagined: bool, ``[R, K]``; each run's own rows are in its column.
         mix: ``"batch"`` or ``"sum"``.
+        importance: of each row among those that a mean is taken of, in whatever unit, ``[R, K]``; None: all alike.
         dtype: of the result, torch's default if None.
 
     Returns:
         ``[R, K]``.  A kind of row that a run does not have contributes nothing.
     """
+    if importance is not None:
+        importance = importance.to(dtype or torch.get_default_dtype())
+        whole = importance.sum(0)
+        if mix == "sum":
+            whole = torch.where(imagined, (importance * imagined).sum(0), (importance * ~imagined).sum(0))
+        return importance / whole
     if mix == "batch":
         return torch.full(imagined.shape, 1 / imagined.shape[0], dtype=dtype, device=imagined.device)
     num_imagined = imagined.sum(0)

@@ -80,8 +80,8 @@ def sac_gradients(
     targets: Sequence[Network],
     batch: Batch,
     *,
-    alpha: float,
-    gamma: float,
+    alpha: float | Tensor,
+    gamma: float | Tensor,
     log_scale_range: tuple[float, float],
 ) -> SACGradients:
     """Losses of Eq. 7-8 and their gradients.
@@ -92,8 +92,8 @@ def sac_gradients(
         targets: the N target critics.
         batch: its weights are those of `coim.objectives.functional.mixing_weights`. Where the networks' weights are
             bfloat16, products are too; what comes out of a network is brought back to the dtype of the batch.
-        alpha: entropy temperature.
-        gamma: discount.
+        alpha: entropy temperature; a scalar tensor where it may change while what is compiled stays.
+        gamma: discount, likewise.
         log_scale_range: the log-scale is clamped to it.
     """
     size, num_actions = batch.observation.shape[-2], batch.action.shape[-1]

@@ -2,13 +2,14 @@
 
 So each run gets exactly the gradient that it would have had alone.
 
-Shapes: ``B`` batch, ``K`` runs, ``R`` rows.
+Shapes: ``U`` updates, ``B`` batch, ``K`` runs, ``R`` rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 
@@ -45,3 +46,28 @@ def check_batch(batch: Sequence[int], num_runs: int | None) -> None:
 def split_runs(rows: Tensor, num_runs: int | None) -> Tensor:
     """Bring one number per row, ``[*B, (K)]``, into the shape ``[R, K]``; ``[R, 1]`` without a run axis."""
     return rows.reshape(-1, num_runs or 1)
+
+
+def by_update(rows: TensorDictBase, num_runs: int | None) -> TensorDictBase:
+    """Bring the batches of a learner into the shape ``[U, B, K]``, with ``K = 1`` where there is no run axis.
+
+    Args:
+        rows: ``[B, K]``, one batch, or ``[U, B, K]``, one for each of U updates.  A single run may leave its axis away:
+            ``[B]``, and with ``num_runs=None`` ``[U, B]``, batches of two rows or more.
+        num_runs: ``K`` of the learner, or None.
+
+    Raises:
+        ValueError: if the rows have another shape, or there are none.
+    """
+    size, runs = rows.batch_size, num_runs or 1
+    if runs == 1 and (len(size) == 1 or (num_runs is None and len(size) == 2 and size[1] != 1)):
+        rows = rows.unsqueeze(-1)
+    check_batch(rows.batch_size, num_runs)
+    if rows.batch_dims == 2:
+        rows = rows.unsqueeze(0)
+    if rows.batch_dims != 3 or rows.batch_size[-1] != runs:
+        raise ValueError(
+            f"rows of batch size {list(size)} are no batches for num_runs={num_runs}: one update takes [B, {runs}], "
+            f"U of them take [U, B, {runs}]"
+        )
+    return rows

@@ -8,7 +8,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,6 +30,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from .functional import bellman_target, mixing_weights, policy_loss, qvalue_loss, soft_value
+from .moving import move
 from .runs import check_batch, check_num_runs, split_runs
 
 
@@ -71,14 +72,21 @@ class CoImSACLoss(LossModule):
         mix: ``"batch"`` takes one mean over real and imagined rows (Sec. 5), ``"sum"`` adds the mean over the imagined
             rows to the mean over the real ones (Eq. 7-8 as printed).
         num_runs: ``K``, the last batch dimension; None averages over the whole batch.
+        reduction: ``"mean"`` as above; ``"sum"`` over all rows; ``"none"``: one number for each row, ``[*B, (K)]``.
 
     Raises:
-        ValueError: if ``mix`` is unknown, a number is out of its range, or ``num_runs`` is not that of the networks.
+        ValueError: if ``mix`` or ``reduction`` is unknown or they do not go together, a number is out of its range, or
+            ``num_runs`` is not that of the networks.
 
     Note:
-        Two optional entries: ``imagined`` (bool, ``[*B, 1]``; absent: all rows are real) and, for tests and common
-        random numbers, ``noise`` and ``("next", "noise")`` (``[*B, A]``), the :math:`\epsilon_t` of the actor's and
-        of the target's action.
+        Optional entries: ``imagined`` (bool, ``[*B, 1]``; absent: all rows are real); ``steps_to_next_obs``
+        (``[*B, 1]``; absent: 1), by which TorchRL's ``MultiStepTransform`` says how far the next state is;
+        ``priority_weight`` (``[*B, 1]``), the importance weights of TorchRL's prioritised replay, for which both losses
+        become weighted means; and, for tests and common random numbers, ``noise`` and ``("next", "noise")``
+        (``[*B, A]``), the :math:`\epsilon_t` of the actor's and of the target's action.
+
+        For prioritised replay ``td_error`` (``[*B, (K)]``, the largest absolute error of the critics) is written into
+        what the loss is called with, as TorchRL's losses do; nothing else is.
 
     Example:
         >>> from coim.models import Policy, PolicyNetwork, QValue, QValueNetwork
@@ -107,6 +115,9 @@ class CoImSACLoss(LossModule):
             terminated: of the next step; the only flag that cuts the bootstrap.
             imagined: whether a row was imagined.
             noise: standard normal of the policy's action.
+            steps_to_next_obs: how many steps ahead the next step is.
+            priority: written, for prioritised replay.
+            priority_weight: importance weight of a row.
         """
 
         action: NestedKey = "action"
@@ -116,6 +127,9 @@ class CoImSACLoss(LossModule):
         terminated: NestedKey = "terminated"
         imagined: NestedKey = "imagined"
         noise: NestedKey = "noise"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -137,10 +151,15 @@ class CoImSACLoss(LossModule):
         gamma: float = 0.99,
         mix: Literal["batch", "sum"] = "batch",
         num_runs: int | None = None,
+        reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
         super().__init__()
         if mix not in ("batch", "sum"):
             raise ValueError(f"mix={mix!r} is unknown; choose 'batch' or 'sum'")
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f"reduction={reduction!r} is unknown; choose 'mean', 'sum' or 'none'")
+        if mix == "sum" and reduction != "mean":
+            raise ValueError(f"mix='sum' adds two means and reduction={reduction!r} takes none; leave one of them away")
         if not 0 <= gamma <= 1:
             raise ValueError(f"gamma={gamma} is outside [0, 1]; Sec. 6.1 has 0.99")
         if not alpha >= 0:
@@ -149,6 +168,7 @@ class CoImSACLoss(LossModule):
             qvalue = CriticList(qvalue)
         check_num_runs(num_runs, policy, qvalue)
         self.alpha, self.gamma, self.mix, self.num_runs = alpha, gamma, mix, num_runs
+        self.reduction = reduction
         self.convert_to_functional(policy, "policy")
         self.convert_to_functional(qvalue, "qvalue", create_target_params=True)
 
@@ -165,34 +185,50 @@ class CoImSACLoss(LossModule):
         if isinstance(self.qvalue, CriticList):
             self.qvalue.out_keys = [self.tensor_keys.state_action_value]
 
+    def _apply(self, fn: Callable[[Tensor], Tensor]) -> CoImSACLoss:
+        """Move to a device or dtype; networks and targets come along."""
+        with move(fn, (self.policy, self.policy_params), (self.qvalue, self.qvalue_params)):
+            super()._apply(fn)
+        return self
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute both losses.
 
         Args:
-            tensordict: ``[*B, (K)]`` transitions; left as they are.
+            tensordict: ``[*B, (K)]`` transitions; ``td_error`` is written, the rest is left as it is.
 
         Returns:
-            The scalars ``loss_actor``, ``loss_qvalue`` and, for the log, ``entropy`` (nats, mean over all rows).
+            ``loss_actor``, ``loss_qvalue`` and, for the log, ``entropy`` (nats): scalars, the entropy a mean over all
+            rows, or with ``reduction="none"`` ``[*B, (K)]``.
         """
         check_batch(tensordict[self.tensor_keys.action].shape[:-1], self.num_runs)
-        loss_qvalue = self.qvalue_loss(tensordict)  # first the target's draw, then the actor's, as TorchRL does
+        # First the target's draw, then the actor's, as TorchRL does.
+        loss_qvalue, td_error = self.qvalue_loss(tensordict)
         loss_actor, log_prob = self.actor_loss(tensordict)
-        return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "entropy": -log_prob.mean()})
+        tensordict.set(self.tensor_keys.priority, td_error)
+        by_row = self.reduction == "none"
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue}
+        return TensorDict(
+            {**losses, "entropy": -log_prob if by_row else -log_prob.mean()}, log_prob.shape if by_row else []
+        )
 
-    def qvalue_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """J_Q of Eq. 7, a scalar; gradient for the critics alone."""
+    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """J_Q of Eq. 7, with gradient for the critics alone, and the error of each row, ``[*B, (K)]``."""
+        tensordict = tensordict.detach()  # the graph that made the rows is not the critics'
         target = self._td_target(tensordict)
         with self.qvalue_params.to_module(self.qvalue, preserve_module_state=False):
             q = self._values(tensordict)
-        return self._expectation(qvalue_loss(q, target), tensordict)
+        td_error = (q.detach() - target.unsqueeze(-1)).abs().amax(-1)
+        return self._reduced(qvalue_loss(q, target), tensordict), td_error
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """J_pi of Eq. 8, a scalar with gradient for the policy alone, and the log-densities, ``[*B, (K)]``."""
+        """J_pi of Eq. 8, with gradient for the policy alone, and the log-densities, ``[*B, (K)]``."""
+        tensordict = tensordict.detach()
         action, log_prob = self._act(tensordict)
         with self.qvalue_params.data.to_module(self.qvalue, preserve_module_state=False):
             q = self._values(tensordict, action)
-        loss = self._expectation(policy_loss(q, log_prob, self.alpha), tensordict)
+        loss = self._reduced(policy_loss(q, log_prob, self.alpha), tensordict)
         return loss, log_prob.detach()
 
     @torch.no_grad()
@@ -205,7 +241,10 @@ class CoImSACLoss(LossModule):
         with self.target_qvalue_params.to_module(self.qvalue, preserve_module_state=False):
             value = soft_value(self._values(after, action), log_prob, self.alpha)
         reward, terminated = after[self.tensor_keys.reward], after[self.tensor_keys.terminated]
-        return bellman_target(reward.squeeze(-1), terminated.squeeze(-1), value, self.gamma)
+        reward, terminated = reward.squeeze(-1), terminated.squeeze(-1)
+        steps = tensordict.get(self.tensor_keys.steps_to_next_obs, None)
+        gamma = self.gamma if steps is None else self.gamma ** steps.reshape(reward.shape).to(reward.dtype)
+        return bellman_target(reward, terminated, value, gamma)
 
     def _act(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         with (
@@ -224,12 +263,19 @@ class CoImSACLoss(LossModule):
             inputs.set(self.tensor_keys.action, action)
         return self.qvalue(inputs)[self.tensor_keys.state_action_value]
 
-    def _expectation(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Mean over the batch in the sense of ``mix``, sum over runs."""
+    def _reduced(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mean over the batch in the sense of ``mix`` and sum over runs, or what ``reduction`` says instead."""
+        importance = tensordict.get(self.tensor_keys.priority_weight, None)
+        if importance is not None:
+            importance = importance.reshape(rows.shape)
+        if self.reduction != "mean":
+            rows = rows if importance is None else rows * importance.to(rows.dtype)
+            return rows if self.reduction == "none" else rows.sum()
         imagined = tensordict.get(self.tensor_keys.imagined, None)
         imagined = torch.zeros_like(rows, dtype=torch.bool) if imagined is None else imagined.squeeze(-1)
+        importance = None if importance is None else split_runs(importance, self.num_runs)
         rows, imagined = split_runs(rows, self.num_runs), split_runs(imagined, self.num_runs)
-        return (mixing_weights(imagined, self.mix, dtype=rows.dtype) * rows).sum()
+        return (mixing_weights(imagined, self.mix, importance=importance, dtype=rows.dtype) * rows).sum()
 
 
 def reparametrised(dist: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -85,6 +85,25 @@ def test_it_is_differentiable_in_the_designs_and_in_nothing_else(parts):
     assert all(p.grad is None for p in (*policy.parameters(), *qvalue.parameters()))
 
 
+def test_start_states_that_carry_a_graph_get_no_gradient(parts):
+    policy, qvalue, starts = parts
+    starts["observation"].requires_grad_()
+    xi = designs(5).requires_grad_()
+    DesignValue(policy, qvalue, starts)(xi).sum().backward()
+    assert starts["observation"].grad is None
+    assert (xi.grad != 0).all()
+
+
+def test_moving_it_moves_networks_and_start_states(parts):
+    policy, qvalue, starts = parts
+    fitness = DesignValue(policy, qvalue, starts).float()
+    for module in (fitness, policy, qvalue):
+        assert {t.dtype for t in [*module.parameters(), *module.buffers()]} == {torch.float32}
+    assert {value.dtype for value in fitness.start_states.values()} == {torch.float32}
+    assert starts["observation"].dtype == torch.float64
+    assert fitness(designs(5).float()).dtype == torch.float32
+
+
 def test_it_follows_the_networks_as_they_train(parts):
     policy, qvalue, starts = parts
     fitness = DesignValue(policy, qvalue, starts)

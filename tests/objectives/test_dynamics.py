@@ -126,6 +126,27 @@ def test_moving_the_loss_moves_the_ensemble(make_rows):
     assert loss.ensemble_params["inputs", "count"].item() == 20
 
 
+def test_rows_that_carry_a_graph_get_no_gradient(make_rows):
+    rows, ensemble = make_rows(20), ensemble_on(make_rows(20))
+    sources = []
+    for key in ("observation", "action", "design", ("next", "observation")):
+        sources.append(rows[key].clone().requires_grad_())
+        rows[key] = sources[-1] * 1.0
+    EnsembleNLLLoss(ensemble)(rows)["loss_dynamics"].backward()
+    assert all(source.grad is None for source in sources)
+    assert all(p.grad is not None for p in ensemble.parameters())
+
+
+def test_a_change_over_several_steps_is_refused(make_rows):
+    rows, loss = make_rows(20), EnsembleNLLLoss(ensemble_on(make_rows(20)))
+    expected = loss(rows)["loss_dynamics"]
+    rows["steps_to_next_obs"] = torch.ones(20, 1, dtype=torch.int64)
+    assert loss(rows)["loss_dynamics"] == expected
+    rows["steps_to_next_obs"][7] = 3
+    with pytest.raises(ValueError, match="'steps_to_next_obs' is up to 3, 1 is needed here: train on rows of single"):
+        loss(rows)
+
+
 def test_a_state_dict_brings_weights_and_statistics_back(make_rows):
     rows = make_rows(20)
     loss, ensemble = EnsembleNLLLoss(ensemble_on(rows)), ensemble_on(make_rows(30, seed=1))

@@ -80,6 +80,14 @@ def test_sum_mixing_of_one_kind_is_its_mean(imagined):
     assert functional.mixing_weights(torch.full((4, 1), imagined), "sum").flatten().tolist() == [0.25] * 4
 
 
+def test_importance_is_shared_out_within_each_mean():
+    imagined = torch.tensor([[False], [False], [True], [True]])
+    importance = torch.tensor([[1.0], [3.0], [2.0], [2.0]])
+    batch, summed = (functional.mixing_weights(imagined, mix, importance=importance) for mix in ("batch", "sum"))
+    assert batch.flatten().tolist() == [0.125, 0.375, 0.25, 0.25]
+    assert summed.flatten().tolist() == [0.25, 0.75, 0.5, 0.5]
+
+
 def test_the_nll_is_eq_6_as_printed():
     nll = functional.gaussian_nll(double(1.0, 2.0), log_var=double(0.0, math.log(4.0)), target=double(3.0, 6.0))
     assert nll.item() == pytest.approx(4 + 16 / 4 + math.log(4))

@@ -68,10 +68,18 @@ def foreign_networks(*, nested: bool = False):
     return policy.double(), [critic.double() for critic in critics]
 
 
-def torchrl_loss(policy, critics, loss: CoImSACLoss) -> SACLoss:
+def torchrl_loss(policy, critics, loss: CoImSACLoss, *, reduction: str = "mean") -> SACLoss:
     """TorchRL's loss with the same weights and targets as ``loss``, which was built on a list of these critics."""
     theirs = SACLoss(
-        policy, critics, num_qvalue_nets=2, loss_function="l2", alpha_init=ALPHA, fixed_alpha=True, target_entropy=0.0
+        policy,
+        critics,
+        num_qvalue_nets=2,
+        loss_function="l2",
+        alpha_init=ALPHA,
+        fixed_alpha=True,
+        target_entropy=0.0,
+        reduction=reduction,
+        scalar_output_mode="non_tensor" if reduction == "none" else None,
     )
     theirs.make_value_estimator(gamma=GAMMA)
     theirs.double()
@@ -193,12 +201,112 @@ def test_only_terminated_cuts_the_bootstrap(policy, qvalue, make_rows):
     assert values["terminated", True] != values["terminated", False]
 
 
-def test_the_input_is_left_as_it_is(policy, qvalue, make_rows):
+def test_the_error_is_written_into_the_input_and_nothing_else(policy, qvalue, make_rows):
     rows = with_noise(make_rows(20))
     before = rows.clone()
     build(policy, qvalue)(rows)
-    assert set(rows.keys(True)) == set(before.keys(True))
-    assert (rows == before).all()
+    assert set(rows.keys(True)) == {*before.keys(True), "td_error"}
+    assert (rows.exclude("td_error") == before).all()
+
+
+def prioritised(make_rows, *, num: int = 256) -> TensorDict:
+    """Rows as TorchRL's prioritised replay and n-step transform hand them out."""
+    rows, g = with_noise(make_rows(num)), torch.Generator().manual_seed(0)
+    rows["steps_to_next_obs"] = torch.randint(1, 6, (num, 1), generator=g)
+    return rows.set("priority_weight", torch.rand(num, generator=g, dtype=torch.float64) + 0.1)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_prioritised_n_step_rows_count_as_in_torchrl(policy, single_critics, make_rows, reduction):
+    rows = prioritised(make_rows).exclude("noise", ("next", "noise"))
+    ours = build(policy, single_critics, reduction=reduction)
+    theirs = torchrl_loss(policy, single_critics, ours, reduction=reduction)
+    given = rows.clone()
+    torch.manual_seed(0)
+    expected = theirs(given)
+    torch.manual_seed(0)
+    out = ours(rows)
+    torch.testing.assert_close(out["loss_actor"], expected["loss_actor"], rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(out["loss_qvalue"], 0.5 * expected["loss_qvalue"], rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(rows["td_error"], given["td_error"], rtol=1e-13, atol=1e-14)
+    assert not rows["td_error"].requires_grad
+    assert list(out.batch_size) == ([256] if reduction == "none" else [])
+
+
+def test_three_steps_ahead_the_future_counts_gamma_cubed(policy, qvalue, make_rows):
+    loss, rows = build(policy, qvalue), with_noise(make_rows(20))
+    rows["steps_to_next_obs"] = torch.full((20, 1), 3)
+    nearer = with_noise(make_rows(20))
+    cubed = CoImSACLoss(policy, qvalue, alpha=ALPHA, gamma=GAMMA**3)
+    SoftUpdate(cubed, tau=0.005)
+    cubed.target_qvalue_params.data.copy_(loss.target_qvalue_params.data)
+    assert loss(rows)["loss_qvalue"].item() == pytest.approx(cubed(nearer)["loss_qvalue"].item(), rel=1e-12)
+
+
+def test_importance_weights_are_shares_of_each_mean_of_each_run(toy_env, make_rows):
+    rows = with_noise(make_rows(40, 3))
+    rows["imagined"] = torch.arange(40).reshape(40, 1, 1).expand(40, 3, 1) >= 30
+    rows["priority_weight"] = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
+    policy = make_policy(toy_env, num_cells=(8,), num_runs=3).double()
+    qvalue = make_qvalue(toy_env, num_cells=(8,), num_runs=3).double()
+    for mix in ("batch", "sum"):
+        out, expected = build(policy, qvalue, mix=mix, num_runs=3)(rows)["loss_qvalue"], 0.0
+        for k in range(3):
+            alone = build(select_run(policy, k), select_run(qvalue, k), reduction="none")
+            weight, imagined = rows["priority_weight"][:, k], rows["imagined"][:, k, 0]
+            weighted = alone(rows[:, k])["loss_qvalue"]  # each row times its weight
+            parts = [imagined | ~imagined] if mix == "batch" else [imagined, ~imagined]
+            expected += sum(weighted[part].sum() / weight[part].sum() for part in parts)
+        torch.testing.assert_close(out, expected, rtol=1e-12, atol=0)
+
+
+def test_the_priority_goes_where_set_keys_says(policy, qvalue, make_rows):
+    loss, rows = build(policy, qvalue), make_rows(8)
+    loss.set_keys(priority=("replay", "error"), priority_weight=("replay", "weight"))
+    loss(rows)
+    assert rows["replay", "error"].shape == (8,)
+
+
+@pytest.mark.parametrize("name", ["loss_actor", "loss_qvalue"])
+def test_rows_that_carry_a_graph_get_no_gradient(policy, qvalue, make_rows, name):
+    rows, sources = with_noise(make_rows(20)), []
+    for key, value in list(rows.items(True, True)):
+        if value.is_floating_point():
+            sources.append(value.clone().requires_grad_())
+            rows[key] = sources[-1] * 1.0
+    loss = build(policy, qvalue)
+    loss(rows)[name].backward()
+    assert all(source.grad is None for source in sources)
+    own, other = (qvalue, policy) if name == "loss_qvalue" else (policy, qvalue)
+    assert any(p.grad is not None and p.grad.any() for p in own.parameters())
+    assert all(p.grad is None for p in other.parameters())
+
+
+@pytest.mark.parametrize("foreign", [True, False])
+def test_moving_the_loss_moves_networks_and_targets(policy, qvalue, make_rows, foreign):
+    if foreign:
+        policy, qvalue = foreign_networks()
+    critics = qvalue if foreign else [qvalue]
+    loss = CoImSACLoss(policy, qvalue)
+    softly = SoftUpdate(loss, tau=0.25)
+    parameters = list(loss.parameters())
+    assert loss.float() is loss
+    for module in (loss, policy, *critics):
+        tensors = [*module.parameters(), *module.buffers()]
+        assert {t.dtype for t in tensors if t.is_floating_point()} == {torch.float32}
+    assert all(a is b for a, b in zip(parameters, loss.parameters(), strict=True))  # an optimiser may hold them
+    held = {p.data_ptr() for p in loss.parameters()}
+    assert held == {p.data_ptr() for module in (policy, *critics) for p in module.parameters()}
+    rows = make_rows(8, dtype=torch.float32)
+    out = loss(rows)
+    assert out["loss_qvalue"].dtype == torch.float32
+    (out["loss_actor"] + out["loss_qvalue"]).backward()
+    torch.optim.SGD(loss.parameters(), lr=1.0).step()
+    before = loss.target_qvalue_params.data.clone()
+    softly.step()
+    expected = before.lerp(loss.qvalue_params.data, 0.25)
+    for key, target in loss.target_qvalue_params.items(True, True):
+        torch.testing.assert_close(target, expected[key])
 
 
 def test_an_absent_next_design_is_the_design(policy, qvalue, make_rows):
@@ -324,6 +432,10 @@ def test_noise_for_a_policy_that_is_no_tanh_normal_is_refused(policy, qvalue, ma
 def test_bad_input_is_named(toy_env, policy, qvalue, make_rows):
     with pytest.raises(ValueError, match="mix='mean' is unknown; choose 'batch' or 'sum'"):
         CoImSACLoss(policy, qvalue, mix="mean")
+    with pytest.raises(ValueError, match="reduction='max' is unknown; choose 'mean', 'sum' or 'none'"):
+        CoImSACLoss(policy, qvalue, reduction="max")
+    with pytest.raises(ValueError, match="mix='sum' adds two means and reduction='none' takes none"):
+        CoImSACLoss(policy, qvalue, mix="sum", reduction="none")
     with pytest.raises(ValueError, match=r"gamma=1\.5 is outside \[0, 1\]"):
         CoImSACLoss(policy, qvalue, gamma=1.5)
     with pytest.raises(ValueError, match=r"alpha=-1 is below 0"):

@@ -1,0 +1,156 @@
+"""Updates over one flat buffer. A recording of operators stands in for a CUDA graph: it, too, repeats what it saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten
+from toy_env import ToyEnv
+
+import coim.flat
+import coim.learner
+from coim import DynamicsLearner, GaussianEnsemble, SACLearner, make_policy, make_qvalue
+
+Rows = Callable[..., TensorDict]
+
+
+class Recording(TorchDispatchMode):
+    """Runs a function twice, and after that only the operators of the second time, on the very same tensors."""
+
+    made: list[Recording] = []  # noqa: RUF012
+
+    def __init__(self, function: Callable[..., Tensor], *, device: torch.device) -> None:
+        super().__init__()
+        self.function, self.device = function, device
+        self.calls: list[tuple[Any, ...]] = []
+        self.warm = False
+        self.made.append(self)
+
+    def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = operator(*args, **(kwargs or {}))
+        self.calls.append((operator, args, kwargs or {}, out))
+        return out
+
+    def __call__(self, *rows: Tensor) -> Tensor:
+        if not self.warm:  # in the first call an optimiser makes its moments
+            self.warm = True
+            return self.function(*rows)
+        if not self.calls:
+            self.rows = [row.clone() for row in rows]
+            with self:
+                self.result = self.function(*self.rows)
+            return self.result.clone()
+        torch._foreach_copy_(self.rows, list(rows))
+        for operator, args, kwargs, recorded in self.calls:
+            for old, new in zip(tree_flatten(recorded)[0], tree_flatten(operator(*args, **kwargs))[0], strict=True):
+                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+        return self.result.clone()
+
+
+@pytest.fixture
+def recordings(monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
+    """Let learners on the CPU capture their updates, as those on CUDA do."""
+    monkeypatch.setattr(Recording, "made", [])
+    monkeypatch.setattr(coim.flat, "CudaGraphModule", Recording)
+    for module in (coim.flat, coim.learner):
+        monkeypatch.setattr(module, "captures", lambda device: True)
+    return Recording.made
+
+
+def sac_learner(**kwargs: Any) -> SACLearner:
+    torch.manual_seed(0)
+    env = ToyEnv()
+    return SACLearner(
+        make_policy(env, num_cells=(16,)).double(), make_qvalue(env, num_cells=(16,)).double(), seed=0, **kwargs
+    )
+
+
+def dynamics_learner() -> DynamicsLearner:
+    torch.manual_seed(0)
+    return DynamicsLearner(GaussianEnsemble.for_env(ToyEnv(), num_cells=(16,)).double())
+
+
+def raise_the_rate(learner: Any) -> None:
+    learner.optimiser.param_groups[0]["lr"] = 0.5**6  # exact in float32, in which a graph reads it
+
+
+def schedule_the_rate(learner: Any) -> None:
+    learner.optimiser.param_groups[0]["lr"] *= 1.0
+    torch.optim.lr_scheduler.LambdaLR(learner.optimiser, lambda epoch: 0.25)
+
+
+def forget_the_gradients(learner: Any) -> None:
+    learner.optimiser.zero_grad()
+
+
+def raise_the_betas(learner: Any) -> None:
+    learner.optimiser.param_groups[0]["betas"] = (0.5, 0.9)
+
+
+def forget_the_moments(learner: Any) -> None:
+    learner.optimiser.state.clear()
+
+
+def raise_alpha(learner: SACLearner) -> None:
+    learner.loss.alpha = 0.5
+
+
+def lower_gamma(learner: SACLearner) -> None:
+    learner.loss.gamma = 0.5
+
+
+def raise_tau(learner: SACLearner) -> None:
+    learner.tau = 0.5
+
+
+OF_BOTH = [raise_the_rate, schedule_the_rate, forget_the_gradients, raise_the_betas, forget_the_moments]
+OF_SAC = [raise_alpha, lower_gamma, raise_tau]
+
+
+@pytest.mark.parametrize(
+    ("make", "change"),
+    [(make, change) for make in (sac_learner, dynamics_learner) for change in OF_BOTH]
+    + [(sac_learner, change) for change in OF_SAC],
+)
+def test_a_captured_update_follows_what_is_changed_after_it(
+    make_rows: Rows, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch, make: Any, change: Any
+) -> None:
+    batches = make_rows(10, 8)
+    captured = make()
+    states = []
+    for learner in (captured, None):
+        if learner is None:
+            monkeypatch.undo()
+            learner = make()
+        learner.update(batches[:5])
+        before = learner.state_dict()["weights"].clone()
+        change(learner)
+        learner.update(batches[5:])
+        states.append(learner.state_dict())
+        assert not torch.equal(states[-1]["weights"], before)
+    assert any(len(recording.calls) > 10 for recording in recordings)
+    for name in {"weights", "targets"} & states[0].keys():
+        torch.testing.assert_close(states[0][name], states[1][name], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [sac_learner, dynamics_learner])
+def test_updates_are_captured_once_on_the_device_of_the_weights(
+    make_rows: Rows, recordings: list[Recording], make: Any
+) -> None:
+    learner = make()
+    for rate in (1e-3, 1e-4, 1e-5):
+        learner.optimiser.param_groups[0]["lr"] = rate
+        learner.update(make_rows(3, 8))
+    assert [recording.device for recording in recordings] == [torch.device("cpu")]
+
+
+def test_updates_are_captured_on_cuda_alone() -> None:
+    assert coim.flat.captures(torch.device("cuda", 1))
+    assert not coim.flat.captures(torch.device("cpu"))
