@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from typing import Any
 from coim import CoAdaptation, DesignChosen, EpisodeDone, MorphEnv
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints, refuse_lost_checkpoints
+from recipes.commands import last_words
 from recipes.forecast import Forecast, work_of
 from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
 from recipes.machine import available_cores, check_compiler, checked_device, choose_products, prepare, words_of
@@ -90,7 +92,7 @@ def train(
         print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how}{by} -> {folder}")
         if on_cpu and settings.precision == "bfloat16" and products.bfloat16 == "emulated":
             print("bfloat16 is emulated by float32 products here, which is slower than --precision float32")
-    again = f"to go on: {again} {folder}"
+    again = f"to go on: {again} {shlex.quote(str(folder))}"
     with locked(folder):
         try:
             with stopping_at_once():
@@ -106,7 +108,7 @@ def train(
             raise OSError(f"{error}; {first}{again}") from error
     picture, report = draw_run(folder, body), write_report([folder], body=body)
     if not settings.quiet:
-        print(f"picture: {picture}\nreport: {report}")
+        print("\n".join([f"picture: {picture}", f"report: {report}", *last_words(folder, name, body, settings)]))
     return folder
 
 

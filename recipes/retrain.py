@@ -15,7 +15,6 @@ skipped, what was stopped is resumed from its checkpoint.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import itertools
 import math
@@ -29,6 +28,7 @@ from pathlib import Path
 
 import tyro
 
+from recipes.commands import plain_sac
 from recipes.interrupt import Stopped, locked, stopping_at_once
 from recipes.machine import available_cores
 from recipes.plots.runs import Place, Run, Runs, read_runs
@@ -246,24 +246,12 @@ def line_of(run: Run, row: Row) -> Line:
 def cell_of(line: Line, asked: Retrain) -> Retraining:
     """Plain SAC on one body: the settings of the cell that found it, less population, imagination and search."""
     settings = saved_settings(asked.study / "cells" / line["cell"])
-    settings = dataclasses.replace(
+    settings = plain_sac(
         settings,
-        designs="none",
-        dream="ensemble",
-        bodies="search",
-        first_design=tuple(map(float, line["xi"].split())),
-        num_designs=1,
-        num_runs=1,
+        [float(xi) for xi in line["xi"].split()],
         first_episodes=settings.first_episodes if asked.episodes is None else asked.episodes,
-        population_updates=0,
-        model_updates=0,
-        individual_mix=0.0,
-        individual_imagined_share=0.0,
         seed=zlib.crc32(line["folder"].encode()),  # of its own, so that no two samples share initial weights
         device="cpu",
-        resume=None,
-        name="retrained",
-        wandb="off",
         quiet=True,
     )
     return Retraining(line["environment"], line["arm"], settings, 0, line["folder"])

@@ -123,11 +123,11 @@ def test_a_signal_ends_a_run_with_the_line_that_resumes_it(
     with monkeypatch.context() as patched:
         patched.setattr(ReplayFile, "append", append_until_stopped)
         with pytest.raises(SystemExit) as stop:
-            run(tmp_path / "stopped", threads=2)
+            run(tmp_path / "a stopped run", threads=2)
     assert stop.value.code == 128 + signum
-    assert f"to go on: python -m recipes.hopper --resume {tmp_path / 'stopped'}" in capsys.readouterr().err
-    resume(tmp_path / "stopped")
-    assert soak.differences(whole, tmp_path / "stopped") == []
+    assert f"to go on: python -m recipes.hopper --resume '{tmp_path / 'a stopped run'}'" in capsys.readouterr().err
+    resume(tmp_path / "a stopped run")
+    assert soak.differences(whole, tmp_path / "a stopped run") == []
 
 
 def dawdle(working: Event, stopping: Event) -> None:

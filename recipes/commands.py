@@ -1,0 +1,103 @@
+"""Command lines that a run tells its user: what films its best body, and what trains that body anew."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coim import MorphEnv
+from coim.envs import BODIES
+from coim.saved_run import TriedDesign, read_designs
+from recipes.reporting.records import number
+from recipes.settings import PRESETS, Settings
+from recipes.writing import shortest
+
+
+def plain_sac(settings: Settings, design: Sequence[float], **changed: Any) -> Settings:
+    """The settings of a run, less population, imagination and search: plain SAC on one body, from scratch.
+
+    Args:
+        settings: of a run.
+        design: the body, ``[D]``.
+        changed: settings that are to have other values besides.
+    """
+    alone: dict[str, Any] = {"designs": "none", "dream": "ensemble", "bodies": "search", "num_designs": 1}
+    alone |= {"num_runs": 1, "population_updates": 0, "model_updates": 0}
+    alone |= {"individual_mix": 0.0, "individual_imagined_share": 0.0}
+    alone |= {"out": None, "resume": None, "name": "retrained", "wandb": "off"}
+    return dataclasses.replace(settings, first_design=tuple(design), **alone | changed)
+
+
+def options(settings: Settings) -> list[str]:
+    """Words of a recipe's command line that give these settings.
+
+    Example:
+        >>> options(Settings(compile=True, seed=3, num_cells=(64, 64)))
+        ['--seed', '3', '--num-cells', '64', '64']
+    """
+    default = PRESETS[settings.preset]
+    words = [] if settings.preset == Settings.preset else ["--preset", settings.preset]
+    for field in dataclasses.fields(Settings):
+        value, name = getattr(settings, field.name), field.name.replace("_", "-")
+        if field.name == "preset" or value == getattr(default, field.name):
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{name}" if value else f"--no-{name}")
+        else:
+            words += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words
+
+
+def best_of(folder: Path) -> TriedDesign | None:
+    """The design with the highest return of all runs in a folder."""
+    tried = [design for design in read_designs(folder) if math.isfinite(design.best_return)]
+    return max(tried, key=lambda design: design.best_return, default=None)
+
+
+def last_words(folder: Path, name: str, body: type[MorphEnv], settings: Settings) -> list[str]:
+    """Lines at the end of a run: its best body, and the commands that film it and train it anew.
+
+    Args:
+        folder: of the run.
+        name: of the recipe.
+        body: the environment.
+        settings: of the run.
+    """
+    best = best_of(folder)
+    if best is None:
+        return []
+    fleet = settings.num_runs > 1
+    of_run = f" of run {best.run}" if fleet else ""
+    lines = [
+        f"best body: design {best.number}{of_run} ({best.kind}), return {number(best.best_return)}: "
+        + in_names(best.design.tolist(), body)
+    ]
+    if BODIES.get(name) is body:  # another body has no recipe of this name
+        film = [
+            "recipes.watch",
+            str(folder),
+            "--design",
+            str(best.number),
+            *(["--run", str(best.run)] if fleet else []),
+        ]
+        alone = plain_sac(settings, [float(shortest(xi)) for xi in best.design.tolist()])
+        lines.append(f"to film it: python -m {shlex.join(film)}")
+        if settings.num_designs > 1:
+            anew = shlex.join([f"recipes.{name}", *options(alone)])
+            lines.append(f"to train it anew, by SAC alone: python -m {anew}")
+    return lines
+
+
+def in_names(design: Sequence[float], body: type[MorphEnv]) -> str:
+    """A design for a reader.
+
+    Example:
+        >>> from coim import HopperMorph
+        >>> in_names([1.0, 0.5, 1.23456, 2.0], HopperMorph)
+        'torso 1, thigh 0.5, shank 1.235, foot 2'
+    """
+    return ", ".join(f"{name} {number(xi)}" for name, xi in zip(body.design_names(), design))
