@@ -135,7 +135,9 @@ def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_on
 def test_designs_are_retrained_once_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recipes.retrain.ray_running", lambda **_: contextlib.nullcontext())  # on the cluster there is
+    monkeypatch.setattr(
+        "recipes.retrain.ray_running", lambda *_, **__: contextlib.nullcontext()
+    )  # on the cluster there is
     for arm in ("none", "known"):
         folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
         experiment.main(HopperMorph, "hopper", [*TINY, "--designs", arm, "--quiet", "--out", str(folder)])
