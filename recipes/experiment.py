@@ -15,13 +15,21 @@ from recipes.checkpoint import Checkpoints, refuse_lost_checkpoints
 from recipes.commands import last_words
 from recipes.forecast import Forecast, work_of
 from recipes.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
-from recipes.machine import available_cores, check_compiler, checked_device, choose_products, prepare, words_of
+from recipes.machine import (
+    FORMERLY,
+    available_cores,
+    check_compiler,
+    checked_device,
+    choose_products,
+    prepare,
+    words_of,
+)
 from recipes.parts import build
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
 from recipes.results import Results, default_folder, refuse_filled, versions
-from recipes.settings import QUICK, Settings, parse, read_config
+from recipes.settings import QUICK, Settings, parse, read_config, saved_settings
 from recipes.wandb_log import WandbLog
 
 
@@ -78,9 +86,9 @@ def train(
     else:
         check_origin(folder, name)
         refuse_lost_checkpoints(folder)
-        config = read_config(folder)
-        changed = config["settings"]["products"] != settings.products
-        products = choose_products(settings.products, begun=config["products"], changed=changed)
+        begun = read_config(folder).get("products", FORMERLY._asdict())
+        changed = saved_settings(folder).products != settings.products
+        products = choose_products(settings.products, begun=begun, changed=changed)
     if settings.compile:
         check_compiler()
     algorithm = make(folder, threads, side_by_side)

@@ -51,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in ("every", "rows"):
             if getattr(asked, name) < 1:
                 raise ValueError(f"--{name} is {getattr(asked, name)}, it must be at least 1")
-        settings = parse(f"{own.prog} {asked.environment}", str(__doc__), [*folder_options(asked.out), *rest])
+        words = [*folder_options(asked.out), *rest]
+        # States are swapped by noisy designs too, whatever the run imagines.
+        settings = parse(f"{own.prog} {asked.environment}", str(__doc__), words, read=("sigma",))
         run(BODIES[asked.environment], asked.environment, settings, every=asked.every, rows=asked.rows)
 
 

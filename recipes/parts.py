@@ -172,5 +172,5 @@ def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
         s0_capacity=sum(episodes),
         art_capacity=max(1, imagined),
         seed=seed,
-        device=checked_device(settings.device),
+        device=checked_device("cpu" if settings.replay_device == "cpu" else settings.device),
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ import tyro
 
 from coim.batches import batch_parts
 from coim.saved_run import read_config
+from recipes.effect import refuse_without_effect
 from recipes.kinds import Interval, fitted, kinds_of, refuse_outside
 
 
@@ -114,6 +116,8 @@ class Settings:
     On in preset paper."""
     device: str = "cpu"
     """Where the networks live: cpu, cuda, cuda:1, ..."""
+    replay_device: Literal["same", "cpu"] = "same"
+    """Where the replay lives: same as the networks, or cpu where a GPU has no room for it; batches are moved then."""
     threads: int = 0
     """Threads that may be busy at once; 0 takes one for each core that this process may use."""
     out: Path | None = None
@@ -146,6 +150,8 @@ QUICK = Settings(
 # What may differ when a run is gone on with, because no number of its past depends on it. Other products round the
 # numbers to come otherwise, as other versions do.
 FREE = {"num_designs", "threads", "products", "checkpoint_every", "resume", "wandb", "quiet"}
+# Settings that came later, with a default that is what all runs had before; these may be missing in a run's folder.
+LATER = {"replay_device", "products"}
 # What the parts of a run refuse in their own words, or not at all; here by the option's name and before there is a run.
 ALLOWED: dict[Interval, tuple[str, ...]] = {
     Interval(1): (
@@ -165,16 +171,19 @@ LIMITS = {name: allowed for allowed, names in ALLOWED.items() for name in names}
 PRESETS = {"paper": Settings(compile=True), "quick": QUICK}
 
 
-def parse(program: str, description: str, arguments: Sequence[str] | None = None) -> Settings:
+def parse(
+    program: str, description: str, arguments: Sequence[str] | None = None, *, read: Collection[str] = ()
+) -> Settings:
     """Read the command line; ``--preset`` only moves the defaults of everything else.
 
     Args:
         program: shown in the usage line.
         description: shown in the help.
         arguments: instead of ``sys.argv[1:]``.
+        read: settings that the program reads for purposes of its own, whether or not they change the run.
 
     Raises:
-        SystemExit: on an unknown option or value, with a sentence on standard error.
+        SystemExit: on an unknown option or value, or one that would change nothing, with a sentence on standard error.
         ValueError: if the folder to resume holds no run, or a setting was changed that its past depends on.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -186,12 +195,30 @@ def parse(program: str, description: str, arguments: Sequence[str] | None = None
         default = saved_settings(known.resume)
     settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
     try:
-        check(settings, called=lambda name: f"--{name.replace('_', '-')}")
+        check(settings, called=option)
+        refuse_without_effect(settings, given(arguments), called=option, read=read)
     except ValueError as error:
         first.error(str(error))
     if known.resume is not None:
         refuse_changes(default, settings)
     return settings
+
+
+def option(name: str) -> str:
+    """What a setting is called on the command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def given(arguments: Sequence[str] | None) -> set[str]:
+    """Names of the settings that are written on a command line, None for this process's.
+
+    Example:
+        >>> sorted(given(["--search", "gradient", "--num_particles=5", "--no-compile"]))
+        ['compile', 'num_particles', 'search']
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    written = {word[2:].split("=")[0].replace("-", "_") for word in words if word.startswith("--")}
+    return {name for name in kinds_of(Settings) if {name, f"no_{name}"} & written}
 
 
 def check(settings: Settings, *, called: Callable[[str], str] = str) -> None:
@@ -234,11 +261,12 @@ def saved_settings(folder: Path) -> Settings:
     """The settings of the run in a folder.
 
     Raises:
-        ValueError: if there is none, or one of a version that had other settings.
+        ValueError: if there is none, or one of a version that had other settings. Those that came later take their
+            defaults.
     """
     saved = read_config(folder)["settings"]
     fields = {field.name for field in dataclasses.fields(Settings)}
-    if other := sorted(fields ^ saved.keys()):
+    if other := sorted((fields ^ saved.keys()) - LATER):
         raise ValueError(
             f"{folder} was made by a version with other settings: {', '.join(other)}; go on with the version in its "
             "config.json"

@@ -19,7 +19,8 @@ from recipes.settings import FREE, Settings, plain, read_config, refuse_changes,
 from recipes.writing import ASIDE
 
 STARTED = "started"  # how a line of a log begins with which a try began
-OF_NO_NUMBER = FREE | {"out", "device", "name"}  # a finished run is what it is wherever it was made and is called
+# A finished run is what it is wherever it was made and is called.
+OF_NO_NUMBER = FREE | {"out", "device", "replay_device", "name"}
 
 
 def compute(environment: str, settings: Settings, log: Path) -> None:

@@ -6,11 +6,12 @@ import dataclasses
 import itertools
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from coim.envs import BODIES
+from recipes.effect import without_effect
 from recipes.kinds import Interval, fitted, kinds_of, refuse_outside
 from recipes.settings import LIMITS, PRESETS, Settings, check
 
@@ -102,7 +103,8 @@ class Study(Block):
     """A block, and more of them where not everything is combined with everything.
 
     Raises:
-        ValueError: if a name is not known, a seed comes twice, or a cell has settings that no run can have.
+        ValueError: if a name is not known, a seed comes twice, a cell has settings that no run can have, or an override
+            changes nothing in any cell.
 
     Example:
         >>> study = Study(name="tiny", environments=("hopper",), arms=("none", "known"), seeds=(0, 1), protocol="smoke")
@@ -132,12 +134,22 @@ class Study(Block):
         for cell in self.cells():
             check(cell.settings)
             refuse_unbuildable(cell)
+        self._refuse_without_effect(self.overrides, self.cells())
+        for block in self.blocks:
+            self._refuse_without_effect(block.overrides, list(self._cells_of(block)))
 
     def cells(self) -> list[Cell]:
         """The runs of this study: one seed of every arm before the next, so that what there is can be compared."""
         columns = [list(self._cells_of(block)) for block in (self, *self.blocks)]
         cells = itertools.chain.from_iterable(columns)
         return sorted(cells, key=lambda cell: cell.position)  # stable: within a position in the order of the blocks
+
+    def _refuse_without_effect(self, overrides: Mapping[str, Any], cells: Sequence[Cell]) -> None:
+        """Refuse an override that changes nothing in any of the cells that it is meant for."""
+        idle = [without_effect(cell.settings) for cell in cells]
+        for name in overrides:
+            if all(name in found for found in idle):
+                raise ValueError(f"in the overrides {idle[0][name]}")
 
     def _cells_of(self, block: Block) -> Iterator[Cell]:
         kinds = kinds_of(Settings)

@@ -18,12 +18,20 @@ from recipes.settings import PRESETS, Settings, parse
 
 XI = ["xi_torso", "xi_thigh", "xi_shank", "xi_foot"]
 TINY = ["--num-designs", "7", "--first-episodes", "1", "--episodes", "1", "--episode-steps", "6", "--num-cells", "8"]
-TINY += ["--individual-updates", "2", "--population-updates", "2", "--model-updates", "2", "--model-cells", "8"]
-TINY += ["--batch-size", "10", "--num-particles", "4", "--num-iterations", "2", "--num-start-states", "3"]
+TINY += ["--individual-updates", "2", "--population-updates", "2", "--batch-size", "10", "--num-start-states", "3"]
+MODEL = ["--model-updates", "2", "--model-cells", "8"]
+SWARM = ["--num-particles", "4", "--num-iterations", "2"]
+
+
+def tiny(*options: str) -> list[str]:
+    """Options of a tiny run, without those that have no effect beside the given ones."""
+    model = [] if {"none", "simulator"} & {*options} else MODEL
+    swarm = [] if {"fixed", "gradient"} & {*options} else SWARM
+    return [*TINY, *model, *swarm, *options]
 
 
 def run(folder: Path, *options: str) -> None:
-    main(HopperMorph, "hopper", [*TINY, "--out", str(folder), *options])
+    main(HopperMorph, "hopper", tiny("--out", str(folder), *options))
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -120,7 +128,7 @@ def test_offline_wandb_needs_no_account(tmp_path: Path, monkeypatch: pytest.Monk
         (["--first-episodes", "0"], "--first-episodes is 0, it must be at least 1"),
         (["--threads", "-1"], "--threads is -1, it must be at least 0"),
         (["--sigma", "-1", "--designs", "noisy"], "sigma is -1"),
-        (["--sigma", "nan"], "sigma is nan"),
+        (["--sigma", "nan", "--designs", "noisy"], "sigma is nan"),
         (["--mix", "stirred"], "stirred"),
         (["--no-such-option"], "no-such-option"),
         (["--preset", "slow"], "slow"),

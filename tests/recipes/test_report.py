@@ -19,7 +19,7 @@ from recipes import experiment
 from recipes.report import main, write_report
 from recipes.reporting.figures import describe_correlation, rank_correlation
 from recipes.reporting.records import curves, read_record, read_records
-from tests.recipes.test_experiment import TINY
+from tests.recipes.test_experiment import tiny
 
 VOID = {"meta", "img", "br"}
 PICTURES = ["Best return of each design", "Learning curves", "Designs over time", "Bodies", "Predicted and achieved"]
@@ -85,7 +85,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     options = {"one": [], "fleet": ["--num-runs", "3"], "free": ["--num-runs", "2", "--designs", "none"]}
     for name, more in options.items():
-        experiment.main(HopperMorph, "hopper", [*TINY, "--quiet", "--out", str(folder / name), *more])
+        experiment.main(HopperMorph, "hopper", tiny("--quiet", "--out", str(folder / name), *more))
     return folder
 
 

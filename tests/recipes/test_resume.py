@@ -17,12 +17,14 @@ import torch
 from interrupted_runs import cut, resume, run
 
 from coim import HopperMorph, load_run
+from coim.products import Choice
 from recipes import model_error, soak
 from recipes.checkpoint import Checkpoints
 from recipes.experiment import main
 from recipes.interrupt import Stopped, end_soon, locked, stopping_at_once
 from recipes.replay_file import ReplayFile
 from recipes.reporting.records import read_rows
+from recipes.settings import LATER
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +89,19 @@ def test_a_run_whose_files_count_the_entries_of_a_design_goes_on_and_is_read(who
     assert [row["xi"] for row in read_rows(folder / "designs.csv")] == [
         row["xi"] for row in read_rows(whole / "designs.csv")
     ]
+
+
+def test_a_run_that_was_begun_before_a_setting_was_there_goes_on(tmp_path: Path, whole: Path) -> None:
+    folder = cut(tmp_path / "cut", 6)
+    config = json.loads((folder / "config.json").read_text())
+    begun_by = config.pop("products")
+    for name in LATER:
+        del config["settings"][name]
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("recipes.experiment.FORMERLY", Choice(**begun_by))  # what a machine has, whichever this is
+        resume(folder)
+    assert soak.differences(whole, folder) == []
 
 
 def test_other_packages_are_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

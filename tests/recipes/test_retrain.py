@@ -16,7 +16,7 @@ from recipes.results import design_columns
 from recipes.retrain import Retrain, best_designs, cell_of, choose, episodes_in_words, main
 from recipes.settings import Settings, parse, plain
 from tests.recipes.made_up_study import read_table, write_cell
-from tests.recipes.test_experiment import TINY
+from tests.recipes.test_experiment import TINY, tiny
 
 XI = design_columns(HopperMorph.design_names())
 PLACE = ("hopper", "forward")
@@ -110,7 +110,7 @@ def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Pat
 
 def settings_of(study: Path, cell: str, **values: object) -> Settings:
     """Give a made-up cell every setting of a run."""
-    settings = parse("test", "", [*TINY, "--designs", "random", "--individual-imagined-share", "0.5", "--lr", "0.001"])
+    settings = parse("test", "", tiny("--designs", "random", "--individual-imagined-share", "0.5", "--lr", "0.001"))
     config = {"environment": "hopper", "settings": plain(settings) | values}
     (study / "cells" / cell / "config.json").write_text(json.dumps(config))
     return settings
@@ -140,7 +140,7 @@ def test_designs_are_retrained_once_and_drawn(
     )  # on the cluster there is
     for arm in ("none", "known"):
         folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
-        experiment.main(HopperMorph, "hopper", [*TINY, "--designs", arm, "--quiet", "--out", str(folder)])
+        experiment.main(HopperMorph, "hopper", tiny("--designs", arm, "--quiet", "--out", str(folder)))
     with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
         main([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
     capsys.readouterr()

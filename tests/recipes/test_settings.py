@@ -7,7 +7,10 @@ from typing import Any
 
 import pytest
 
+from coim import HopperMorph
+from recipes.effect import RULES
 from recipes.kinds import kinds_of
+from recipes.parts import make_buffers
 from recipes.settings import LIMITS, PRESETS, Settings, check, parse
 from recipes.studies.definition import PROTOCOLS
 
@@ -79,6 +82,32 @@ def test_no_number_is_without_a_limit() -> None:
             ["--dream", "simulator", "--designs", "none"],
             "error: --dream simulator has nothing to imagine with --designs none; take known, noisy or random\n",
         ),
+        (
+            ["--search", "gradient", "--num-particles", "700"],
+            "error: --num-particles has no effect with --search gradient; leave it out\n",
+        ),
+        (
+            ["--swarm_bounds=nearest", "--bodies", "random"],
+            "error: --swarm-bounds has no effect with --bodies random; leave it out\n",
+        ),
+        (
+            ["--bodies", "fixed", "--search", "swarm"],
+            "error: --search has no effect with --bodies fixed; leave it out\n",
+        ),
+        (["--sigma", "0.2"], "error: --sigma has no effect with --designs known; leave it out\n"),
+        (
+            ["--designs", "none", "--model-cells", "8"],
+            "error: --model-cells has no effect with --designs none; leave it out\n",
+        ),
+        (
+            ["--dream", "simulator", "--predict", "next"],
+            "error: --predict has no effect with --dream simulator; leave it out\n",
+        ),
+        (
+            ["--imagined-share", "0", "--mix", "sum"],
+            "error: --mix has no effect with --imagined-share 0.0; leave it out\n",
+        ),
+        (["--out", "a", "--name", "b"], "error: --name has no effect with --out a; leave it out\n"),
     ],
 )
 def test_the_command_line_calls_a_setting_by_its_option(
@@ -88,3 +117,21 @@ def test_the_command_line_calls_a_setting_by_its_option(
         parse("prog", "", options)
     assert stop.value.code == 2
     assert capsys.readouterr().err.endswith(sentence)
+
+
+def test_what_has_an_effect_is_taken_and_so_is_a_default_that_has_none() -> None:
+    assert parse("prog", "", ["--search", "gradient"]).num_particles == 700
+    assert parse("prog", "", ["--designs", "noisy", "--sigma", "0.2"]).sigma == 0.2
+    assert parse("prog", "", ["--designs", "none", "--individual-mix", "0.1"]).individual_mix == 0.1
+    assert parse("prog", "", ["--sigma", "0.2"], read=("sigma",)).sigma == 0.2  # a program's own use
+
+
+def test_rules_are_about_settings() -> None:
+    assert {name for names, _, by in RULES for name in (*names, by)} <= kinds_of(Settings).keys()
+
+
+def test_the_replay_may_stay_on_the_cpu_whatever_the_device() -> None:
+    """A device without memory stands for a GPU."""
+    settings = Settings(device="meta", replay_device="cpu", num_designs=1, first_episodes=1, episode_steps=5)
+    buffers = make_buffers(HopperMorph(episode_steps=5, seed=0), settings, seed=0)
+    assert buffers.pop.storage.device.type == "cpu"

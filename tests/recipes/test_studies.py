@@ -99,6 +99,18 @@ def test_what_cannot_be_is_named_before_anything_is_computed(fields: dict, sente
         study(**fields)
 
 
+def test_an_override_that_changes_nothing_where_it_is_written_is_refused() -> None:
+    climbing = {"search": "gradient", "num_particles": 9}
+    with pytest.raises(ValueError, match="in the overrides num_particles has no effect with search gradient"):
+        study(overrides=climbing)
+    with pytest.raises(ValueError, match="sigma has no effect with designs none; leave it out"):
+        study(arms=("none", "oracle"), overrides={"sigma": 0.2})
+    assert study(arms=("none", "noisy"), overrides={"sigma": 0.2}).overrides  # it has one in some of the cells
+    more = Block(environments=("walker",), arms=("none",), seeds=(9,), overrides={"model_lr": 0.1})
+    with pytest.raises(ValueError, match="model_lr has no effect with designs none"):
+        study(arms=("known",), blocks=(more,))
+
+
 @pytest.mark.parametrize(("seeds", "twice"), [((3,), "none-3"), ((4, 3), "none-3, hopper-forward-none-4")])
 def test_a_seed_that_two_blocks_share_is_named_with_its_place(seeds: tuple[int, ...], twice: str) -> None:
     """Also where it is not the first of its cell, which alone names the cell's folder."""
