@@ -47,7 +47,7 @@ def transition_rows(transitions: TensorDictBase) -> TensorDict:
         The rows, ``[*B]``, in a tensordict of their own; the tensors are shared with ``transitions``.
 
     Raises:
-        ValueError: if an entry of the schema is missing.
+        ValueError: if an entry of the schema is missing, or has not one dimension more than the batch.
     """
     missing = [key for key in ROW_KEYS if key not in transitions.keys(include_nested=True)]
     if missing:
@@ -55,7 +55,33 @@ def transition_rows(transitions: TensorDictBase) -> TensorDict:
             f"transitions lack {missing}; step an environment that has `design` in its observation spec, such as a "
             "morph environment or WorldModelEnv, and pass what it returns"
         )
-    return transitions.select(*ROW_KEYS)
+    rows = transitions.select(*ROW_KEYS)
+    for key in ROW_KEYS:
+        if rows[key].ndim != rows.batch_dims + 1:
+            raise ValueError(
+                f"{key} has shape {list(rows[key].shape)}, which must be batch size {list(rows.batch_size)} and one "
+                "dimension for its entries; a single number has a last dimension of 1"
+            )
+    return rows
+
+
+def time_is_last(rows: TensorDictBase) -> bool:
+    """Whether rows are known to be ``[K, T]``, runs first, as a rollout returns them.
+
+    The name of the dimension tells. Rows without names are told by their content, if there are as many steps as runs:
+    in time, a row begins where the one before it ended.
+    """
+    if "time" in rows.names:
+        return rows.names[0] != "time"
+    steps, runs = rows.batch_size
+    return steps == runs > 1 and _goes_on_along(rows, 1) and not _goes_on_along(rows, 0)
+
+
+def _goes_on_along(rows: TensorDictBase, dim: int) -> bool:
+    """Whether each row begins where the one before it in a dimension ended, except behind the end of an episode."""
+    last = rows.shape[dim] - 1
+    reached, begun = rows["next", "observation"].narrow(dim, 0, last), rows["observation"].narrow(dim, 1, last)
+    return bool(((reached == begun) | rows["next", "done"].narrow(dim, 0, last)).all())
 
 
 class TransitionBuffer(TensorDictReplayBuffer):
@@ -65,7 +91,7 @@ class TransitionBuffer(TensorDictReplayBuffer):
         capacity: elements it can hold; the oldest are overwritten.
         num_runs: K, the batch size of an element.
         seed: of the generator that draws samples.
-        device: where the rows live and samples are drawn.
+        device: where the rows live and samples are drawn; rows come from any device, samples are on this one.
 
     Example:
         >>> buffer = TransitionBuffer(100, num_runs=2, seed=0)
@@ -88,8 +114,19 @@ class TransitionBuffer(TensorDictReplayBuffer):
         self.capacity = capacity
         self.num_runs = num_runs
 
+    def add(self, data: TensorDictBase) -> int:
+        """Store one time step ``[K]``, as :meth:`extend` stores many.
+
+        Returns:
+            Where it went.
+
+        Raises:
+            ValueError: as :meth:`extend`.
+        """
+        return int(self.extend(data.unsqueeze(0)))
+
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> torch.Tensor:
-        """Store transitions; the argument is left as it is.
+        """Store the numbers of transitions, without their graph; the argument is left as it is.
 
         Args:
             tensordicts: ``[T, K]``, as for :func:`transition_rows`.
@@ -99,7 +136,8 @@ class TransitionBuffer(TensorDictReplayBuffer):
             Where the rows went.
 
         Raises:
-            ValueError: if the batch is not ``[T, K]``, is longer than the capacity, or lacks an entry.
+            ValueError: if the batch is not ``[T, K]``, is longer than the capacity, or lacks an entry; also if it is
+                ``[K, T]`` with as many runs as steps, as far as that can be seen (see :func:`time_is_last`).
         """
         shape = tensordicts.batch_size
         if len(shape) != 2 or shape[1] != self.num_runs:
@@ -109,7 +147,13 @@ class TransitionBuffer(TensorDictReplayBuffer):
             )
         if shape[0] > self.capacity:
             raise ValueError(f"{shape[0]} rows do not fit into a buffer of {self.capacity}; enlarge its capacity")
-        return super().extend(transition_rows(tensordicts), update_priority=update_priority)
+        rows = transition_rows(tensordicts)
+        if time_is_last(rows):
+            raise ValueError(
+                f"time is the last dimension of rows {list(shape)}, it must be the first, [T, {self.num_runs}]; "
+                "transpose(0, 1) what env.rollout returns"
+            )
+        return super().extend(rows.detach().to(self.storage.device), update_priority=update_priority)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled rows (views, not copies), the writer's place and the generator's state."""
@@ -195,7 +239,8 @@ class Buffers:
         capacities = {"pop": pop_capacity, "ind": ind_capacity, "s0": s0_capacity, "art": art_capacity}
         if len(env.batch_size) != 1:
             raise ValueError(f"the environment has batch size {list(env.batch_size)}, the buffers need [K], its runs")
-        seeds = torch.randint(2**62, (len(capacities),), generator=torch.Generator().manual_seed(seed)).tolist()
+        rng = torch.Generator("cpu").manual_seed(seed)
+        seeds = torch.randint(2**62, (len(capacities),), generator=rng, device="cpu").tolist()
         return cls(
             **{
                 name: TransitionBuffer(capacity, num_runs=env.batch_size[0], seed=own_seed, device=device)

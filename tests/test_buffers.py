@@ -124,6 +124,66 @@ def test_a_checkpoint_holds_the_filled_rows_and_sampling_goes_on(tmp_path: Path)
     assert len(resumed.art) == 0
 
 
+def test_one_time_step_is_stored_as_many_are() -> None:
+    buffer = TransitionBuffer(5, num_runs=2, seed=0)
+    buffer.extend(make_rows(3, 2))
+    assert buffer.add(make_rows(1, 2, first=7.0)[0].set("step_count", torch.zeros(2, 1))) == 3
+    assert keys_of(buffer[:]) == set(ROW_KEYS)
+    assert buffer[:]["observation"][3, :, 0].tolist() == [7.0, 1007.0]
+    with pytest.raises(ValueError, match=r"lack \['design'\]"):
+        buffer.add(make_rows(1, 2)[0].exclude("design"))
+    with pytest.raises(ValueError, match=r"batch size \[1\], \[T, 2\] is needed"):
+        buffer.add(make_rows(1)[0, 0])
+    assert len(buffer) == 4
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_rollout_with_as_many_steps_as_runs_is_not_taken_for_time_first(toy_env: EnvBase, named: bool) -> None:
+    env = type(toy_env)(num_runs=3, episode_steps=9)  # type: ignore[call-arg]
+    rollout, buffer = env.rollout(3), TransitionBuffer(9, num_runs=3, seed=0)
+    if not named:
+        rollout = TensorDict(rollout.to_dict(), [3, 3])
+    with pytest.raises(ValueError, match=r"time is the last dimension of rows \[3, 3\]"):
+        buffer.extend(rollout)
+    buffer.extend(rollout.transpose(0, 1))
+    assert torch.equal(buffer[:]["observation"][:, 0], rollout["observation"][0])
+
+
+def test_one_step_of_all_runs_is_no_episode_of_one(toy_env: EnvBase) -> None:
+    rollout = type(toy_env)(num_runs=3, episode_steps=9).rollout(3)  # type: ignore[call-arg]
+    with pytest.raises(ValueError, match="time is the last dimension"):
+        TransitionBuffer(9, num_runs=3, seed=0).add(rollout[0])
+
+
+def test_stored_rows_have_no_graph() -> None:
+    rows, buffer = make_rows(3), TransitionBuffer(9, seed=0)
+    rows["action"] = torch.ones(3, 1, 1, requires_grad=True) * 2
+    buffer.extend(rows)
+    buffer.add(rows[0])
+    assert not any(value.requires_grad for value in buffer[:].values(True, True))
+    assert rows["action"].requires_grad  # what was given keeps its graph
+
+
+def test_an_entry_without_a_dimension_of_its_own_is_refused() -> None:
+    rows = make_rows(3, 2)
+    rows["next", "reward"] = torch.zeros(3, 2)
+    with pytest.raises(ValueError, match=r"\('next', 'reward'\) has shape \[3, 2\]"):
+        transition_rows(rows)
+
+
+def test_buffers_do_not_depend_on_torchs_default_device() -> None:
+    def draw() -> torch.Tensor:
+        env = cast(EnvBase, SimpleNamespace(batch_size=torch.Size([1])))
+        buffers = Buffers.for_env(env, pop_capacity=9, ind_capacity=9, s0_capacity=9, art_capacity=9, seed=0)
+        buffers.pop.extend(rows)
+        return buffers.pop.sample(20)["observation"]
+
+    rows = make_rows(9)
+    expected = draw()
+    with torch.device("meta"):
+        assert torch.equal(draw(), expected)
+
+
 def test_rows_that_do_not_fit_are_refused() -> None:
     buffer = TransitionBuffer(5, num_runs=2, seed=0)
     with pytest.raises(ValueError, match=r"\[2, 4\], \[T, 2\] is needed"):
