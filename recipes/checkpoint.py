@@ -35,7 +35,7 @@ from coim.checkpoints import (
 )
 from recipes.best_policies import BestPolicies
 from recipes.replay_file import ReplayFile
-from recipes.writing import sync
+from recipes.writing import ASIDE, sync, telling_full_disk
 
 KEPT = 2
 
@@ -67,17 +67,18 @@ class Checkpoints:
         Raises:
             OSError: if it cannot be written: a full disk, a folder that has become read-only.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
         state, rows = without_replay(self.algorithm.state_dict())
-        aside = self.folder / ".new"
+        aside, path = self.folder / ASIDE.format(PREFIX), self.folder / f"{PREFIX}-{self._step + 1:012d}"
         try:
-            self._replay.append({key: value[self._replay.num_rows :] for key, value in rows.items()})
-            about = {"format": FORMAT, "replay": self._replay.description(), **notes}
-            parts({"algorithm": Held(state), "best": self.best}, about).save(aside)
-            seal(aside)
-            os.replace(aside, self.folder / f"{PREFIX}-{self._step + 1:012d}")
-            sync(self.folder)
-        except (OSError, RuntimeError) as error:  # torch.save says RuntimeError when a disk is full
+            with telling_full_disk(path):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                self._replay.append({key: value[self._replay.num_rows :] for key, value in rows.items()})
+                about = {"format": FORMAT, "replay": self._replay.description(), **notes}
+                parts({"algorithm": Held(state), "best": self.best}, about).save(aside)
+                seal(aside)
+                os.replace(aside, path)
+                sync(self.folder)
+        except (OSError, RuntimeError) as error:
             last = f"the last one, number {self._step}, is good" if self._step else "there is none yet"
             shutil.rmtree(aside, ignore_errors=True)
             reason = str(error).splitlines()[0]

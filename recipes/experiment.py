@@ -111,10 +111,13 @@ def train(
             begun = (folder / "config.json").is_file()
             print(f"\n{stop}; {again if begun else 'nothing was written yet, start it again'}", file=sys.stderr)
             sys.exit(128 + stop.signum)
-        except OSError as error:  # a full disk, most likely
+        except OSError as error:
             first = f"make {folder} writable; " if says_read_only(error) else ""
             raise OSError(f"{error}; {first}{again}") from error
-    picture, report = draw_run(folder, body), write_report([folder], body=body)
+    try:
+        picture, report = draw_run(folder, body), write_report([folder], body=body)
+    except OSError as error:
+        raise OSError(f"{error}; the run is over, and its page is made by python -m recipes.report {folder}") from error
     if not settings.quiet:
         print("\n".join([f"picture: {picture}", f"report: {report}", *last_words(folder, name, body, settings)]))
     return folder

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from recipes.writing import FULL, NOT_OFFERED, telling_full_disk, warn_once
+
 LOCK = ".lock"
 PATIENCE = 3  # s
 READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -108,6 +110,10 @@ def locked(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("a+")
     except OSError as error:
+        if error.errno in FULL:
+            raise OSError(
+                f"disk full: {folder} cannot be written to; make room there, or name another --out"
+            ) from error
         first = "make it writable, or " if error.errno in READ_ONLY else ""
         raise OSError(
             f"{folder} cannot be written to ({error.strerror}); {first}name another folder for a new run with --out"
@@ -119,9 +125,16 @@ def locked(folder: Path) -> Iterator[None]:
             file.seek(0)
             owner = file.read().strip() or "another process"
             raise BlockingIOError(f"{folder} is in use by {owner}; wait for it, or stop it") from None
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {os.uname().nodename}")
-        file.flush()
+        except OSError as error:
+            if error.errno not in NOT_OFFERED | {errno.ENOLCK}:
+                raise
+            warn_once(
+                f"{folder} cannot be locked, its file system has no locks ({error.strerror}); the run goes on, but let "
+                "no second process write to it"
+            )
+        with telling_full_disk(folder / LOCK):
+            file.truncate(0)
+            os.write(file.fileno(), f"process {os.getpid()} on {os.uname().nodename}".encode())
         yield
 
 

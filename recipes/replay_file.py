@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recipes.writing import telling_full_disk
+
 
 class ReplayFile:
     """Rows in the order in which they came, each a fixed number of bytes, one entry after the other.
@@ -42,7 +44,7 @@ class ReplayFile:
         columns = {key: np.ascontiguousarray(rows[key].detach().cpu().numpy()) for key in sorted(rows)}
         self._layout = [[key, column.dtype.str, list(column.shape[1:])] for key, column in columns.items()]
         table = np.concatenate([column.reshape(count, -1).view(np.uint8) for column in columns.values()], 1)
-        with self.path.open("r+b" if self.path.exists() else "wb") as file:
+        with telling_full_disk(self.path), self.path.open("r+b" if self.path.exists() else "wb") as file:
             file.truncate(self._size)  # an append that failed may have left a part of itself
             file.seek(self._size)
             file.write(table.data)

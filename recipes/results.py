@@ -20,7 +20,7 @@ from coim.events import running
 from coim.products import chosen
 from recipes.interrupt import LOCK
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
-from recipes.writing import shortest, write_whole
+from recipes.writing import ASIDE, shortest, telling_full_disk, write_whole
 
 DESIGN_PREFIX = "xi_"  # of the columns that hold a design
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
@@ -233,7 +233,7 @@ class Table:
 
     def append(self, rows: Iterable[Sequence[Any]]) -> None:
         cells = [[_cell(value) for value in row] for row in rows]
-        with self.path.open("a", newline="") as file:
+        with telling_full_disk(self.path), self.path.open("a", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(cells)
             file.flush()
             os.fsync(file.fileno())
@@ -290,8 +290,9 @@ def note_resumption(folder: Path, settings: Settings) -> None:
 
 
 def refuse_filled(folder: Path) -> None:
-    """Leave a folder alone that holds anything but our own lock."""
-    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
+    """Leave a folder alone that holds anything but our own lock, and a first file that was not finished."""
+    ours = {LOCK, ASIDE.format("config.json")}
+    if folder.exists() and (not folder.is_dir() or any(path.name not in ours for path in folder.iterdir())):
         raise FileExistsError(
             f"{folder} already holds something; name another folder with --out, move it away, or go on with the run in "
             f"it by --resume {folder}"

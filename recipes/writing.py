@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import functools
 import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
-ASIDE = ".{}.new"  # a file's name until it is whole
+ASIDE = ".new-{}"  # a file's name until it is whole
+FULL = {errno.ENOSPC, errno.EDQUOT}
+NOT_OFFERED = {errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}  # by a file system: a network's, a container's
+PROBE = 1 << 16  # bytes
 
 
 def shortest(value: float) -> str:
@@ -21,20 +30,86 @@ def shortest(value: float) -> str:
 
 
 def write_whole(path: Path, contents: str | bytes) -> None:
-    """Write a file so that it has either its old contents or the new ones, whatever happens."""
+    """Write a file so that it has either its old contents or the new ones, whatever happens.
+
+    Raises:
+        OSError: if it cannot be written; of a full disk in a sentence.
+    """
+    with written_aside(path) as aside:
+        aside.write_bytes(contents.encode() if isinstance(contents, str) else contents)
+
+
+@contextmanager
+def written_aside(path: Path) -> Iterator[Path]:
+    """Let a file be written under another name in the same folder, with the same suffix, and put it in its place.
+
+    What is left of it after an error is deleted; see also `telling_full_disk`.
+    """
     aside = path.with_name(ASIDE.format(path.name))
-    with aside.open("wb") as file:
-        file.write(contents.encode() if isinstance(contents, str) else contents)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
-    sync(path.parent)
+    try:
+        with telling_full_disk(path):
+            yield aside
+            sync(aside)
+            os.replace(aside, path)
+            sync(path.parent)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+@contextmanager
+def telling_full_disk(path: Path) -> Iterator[None]:
+    """Say of what fails while a file is written that the disk is full, where that is why.
+
+    Libraries that write files raise errors of their own, which do not say it.
+
+    Raises:
+        OSError: that says so; every other error stays what it is.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if getattr(error, "errno", None) not in FULL and not has_no_room(path.parent):
+            raise
+        raise OSError(f"disk full: {path} could not be written; make room on the disk of {path.parent}") from error
+
+
+def has_no_room(folder: Path) -> bool:
+    """Whether the disk of a folder is too full for a small file."""
+    probe = folder / ASIDE.format(f"probe-{os.getpid()}")
+    try:
+        with probe.open("wb") as file:
+            file.write(bytes(PROBE))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return error.errno in FULL
+    finally:
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)
+    return False
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's contents, or a folder's entries, are on the disk."""
+    """Wait until a file's contents, or a folder's entries, are on the disk; not every file system does it for folders.
+
+    Raises:
+        OSError: if they are not.
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in NOT_OFFERED | {errno.EINVAL} or not stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise
+        warn_once(
+            f"this file system does not write folders to the disk when it is asked to ({error.strerror}); the run goes "
+            "on, but if the power goes its last files may be lost"
+        )
     finally:
         os.close(descriptor)
+
+
+@functools.cache
+def warn_once(sentence: str) -> None:
+    """Write a line to standard error, the first time."""
+    print(f"warning: {sentence}", file=sys.stderr)

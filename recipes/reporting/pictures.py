@@ -11,6 +11,7 @@ from coim import MorphEnv
 from recipes.reporting.bodies import draw_bodies
 from recipes.reporting.curves import cross_handles, explain, plot_over_designs
 from recipes.reporting.records import read_record
+from recipes.writing import written_aside
 
 BODIES_SHOWN = 8
 
@@ -46,5 +47,6 @@ def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
 def save(figure: Figure, path: Path) -> None:
     """Write a figure and free it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with written_aside(path) as aside:
+        figure.savefig(aside, dpi=150)
     plt.close(figure)

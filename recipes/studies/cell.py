@@ -43,7 +43,7 @@ def compute(environment: str, settings: Settings, log: Path) -> None:
 
 
 def to_go_on(settings: Settings) -> Settings:
-    """The settings with which a cell is begun, or with which its run is resumed; makes room for one that begins.
+    """The settings with which a cell is begun, or with which its run is resumed.
 
     Raises:
         ValueError: if the folder holds files of a run and no config.json; see also `resumed`.
@@ -53,15 +53,12 @@ def to_go_on(settings: Settings) -> Settings:
         raise ValueError("a cell has a folder")
     if (going_on := resumed(settings, folder)) is not None:
         return going_on
-    there = [path for path in folder.glob("*") if path.name != LOCK]
     # config.json is the first file of a run; a process that was killed before left it half written.
-    if found := [path.name for path in there if path.name != ASIDE.format("config.json")]:
+    if found := {path.name for path in folder.glob("*")} - {LOCK, ASIDE.format("config.json")}:
         raise ValueError(
             f"{folder} holds {', '.join(sorted(found))} and no config.json; put that back from a copy, or move the "
             "folder away to begin anew"
         )
-    for path in there:
-        path.unlink()
     return settings
 
 

@@ -262,10 +262,9 @@ def test_a_folder_that_has_lost_its_config_is_not_emptied(tmp_path: Path) -> Non
 def test_what_a_process_left_that_was_killed_at_once_is_begun_anew(tmp_path: Path) -> None:
     folder = tmp_path / "a"
     folder.mkdir()
-    (folder / ".config.json.new").write_text('{"settings"')
+    (folder / ".new-config.json").write_text('{"settings"')
     settings = dataclasses.replace(TINY, out=folder)
     assert to_go_on(settings) == settings
-    assert not list(folder.iterdir())
 
 
 def test_an_address_at_which_no_cluster_is_is_told_at_once(tmp_path: Path) -> None:
@@ -308,11 +307,12 @@ def test_a_cell_that_was_begun_with_other_settings_is_refused_by_name_and_logged
 
 
 def test_what_a_process_had_not_finished_when_it_was_killed_is_in_nobodys_way(tmp_path: Path) -> None:
-    (tmp_path / ".config.json.new").write_text("{")
+    (tmp_path / ".new-config.json").write_text("{")
     compute(
         "hopper", dataclasses.replace(TINY, out=tmp_path, num_designs=1, first_episodes=1), tmp_path.with_suffix(".log")
     )
     assert episodes_done(tmp_path, 1) == 1
+    assert not (tmp_path / ".new-config.json").exists()
 
 
 def test_the_study_of_the_readme_is_one(tmp_path: Path) -> None:

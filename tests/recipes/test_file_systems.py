@@ -1,0 +1,172 @@
+"""Disks that are full, and file systems that have no locks or do not sync folders."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from interrupted_runs import resume, run
+
+from recipes import soak, writing
+from recipes.best_policies import BestPolicies
+from recipes.checkpoint import Checkpoints
+from recipes.interrupt import locked
+from recipes.replay_file import ReplayFile
+from recipes.report import write_report
+from recipes.results import Results
+from recipes.writing import sync, warn_once, write_whole, written_aside
+
+FSYNC = os.fsync
+
+
+@pytest.fixture(autouse=True)
+def nothing_was_said_yet() -> Iterator[None]:
+    warn_once.cache_clear()
+    yield
+    warn_once.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on a usual disk."""
+    return run(tmp_path_factory.mktemp("usual") / "whole")
+
+
+def failing_with(number: int) -> Callable[..., None]:
+    def fail(*args: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+def fsync_of_files_only(number: int) -> Callable[[int], None]:
+    def fsync(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        FSYNC(descriptor)
+
+    return fsync
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP])
+@pytest.mark.parametrize("no_lock", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_and_synced_folders_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, number: int, no_lock: int
+) -> None:
+    monkeypatch.setattr("fcntl.flock", failing_with(no_lock))
+    monkeypatch.setattr("os.fsync", fsync_of_files_only(number))
+    with locked(tmp_path):
+        for i in range(3):
+            write_whole(tmp_path / "file", str(i))
+    assert (tmp_path / "file").read_text() == "2"
+    first, second = capsys.readouterr().err.splitlines()
+    assert f"warning: {tmp_path} cannot be locked, its file system has no locks" in first
+    assert f"does not write folders to the disk when it is asked to ({os.strerror(number)})" in second
+
+
+def test_a_run_goes_on_there_and_is_the_same_run(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("fcntl.flock", failing_with(errno.ENOLCK))
+    monkeypatch.setattr("os.fsync", fsync_of_files_only(errno.EINVAL))
+    folder = run(tmp_path / "run")
+    assert len(capsys.readouterr().err.splitlines()) == 2
+    assert soak.differences(whole, folder) == []
+    assert (folder / "report.html").is_file()
+
+
+def test_every_other_error_of_locks_and_of_syncing_stays_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr("fcntl.flock", failing_with(errno.EIO))
+        with pytest.raises(OSError, match=os.strerror(errno.EIO)), locked(tmp_path):
+            raise AssertionError
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", fsync_of_files_only(errno.EIO))
+        with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+            sync(tmp_path)
+    # That a file's contents are not on the disk is never only a warning.
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("os.fsync", failing_with(errno.EINVAL))
+    with pytest.raises(OSError, match=os.strerror(errno.EINVAL)):
+        sync(tmp_path / "file")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_file_that_finds_no_room_stays_as_it_was_and_nothing_lies_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    path = tmp_path / "file"
+    write_whole(path, "old")
+    monkeypatch.setattr("os.fsync", failing_with(number))
+    with pytest.raises(OSError, match=f"^disk full: {path} could not be written; make room on the disk of {tmp_path}$"):
+        write_whole(path, "new")
+    assert [found.name for found in tmp_path.iterdir()] == ["file"]
+    assert path.read_text() == "old"
+
+
+@pytest.mark.parametrize("error", [RuntimeError("inline_container.cc:664"), OSError("the writer has failed")])
+def test_a_librarys_own_error_is_told_as_a_full_disk_only_on_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def write() -> None:
+        with written_aside(tmp_path / "file") as aside:
+            aside.touch()
+            raise error
+
+    with pytest.raises(type(error), match=str(error)):
+        write()
+    monkeypatch.setattr(writing, "has_no_room", lambda folder: folder == tmp_path)
+    with pytest.raises(OSError, match=r"^disk full: "):
+        write()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("owner", "method"),
+    [(ReplayFile, "append"), (Checkpoints, "save"), (Results, "write"), (BestPolicies, "follow")],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_a_run_that_fills_its_disk_says_so_and_how_it_goes_on(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: type, method: str
+) -> None:
+    folder, write, calls = tmp_path / "run", getattr(owner, method), 0
+
+    def write_to_a_full_disk(*args: object) -> None:
+        nonlocal calls
+        calls += 1
+        with monkeypatch.context() as patched:
+            if calls >= 5:
+                patched.setattr("os.fsync", failing_with(errno.ENOSPC))
+            write(*args)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, method, write_to_a_full_disk)
+        with pytest.raises(OSError, match="disk full: ") as stop:
+            run(folder)
+    said = str(stop.value)
+    assert f"make room on the disk of {folder}" in said
+    assert f"to go on: python -m recipes.hopper --resume {folder}" in said
+    assert "\n" not in said
+    resume(folder)
+    assert soak.differences(whole, folder) == []
+
+
+def test_a_disk_that_is_full_when_the_page_is_written_does_not_cost_the_run(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_on_a_full_disk(*args: Any, **kwargs: Any) -> Path:
+        with monkeypatch.context() as patched:
+            patched.setattr("os.fsync", failing_with(errno.ENOSPC))
+            return write_report(*args, **kwargs)
+
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr("recipes.experiment.write_report", write_on_a_full_disk)
+        with pytest.raises(OSError, match=rf"disk full: .*python -m recipes.report {folder}"):
+            run(folder)
+    assert soak.differences(whole, folder) == []
