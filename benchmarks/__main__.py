@@ -16,19 +16,32 @@ from benchmarks import table
 from benchmarks.bodies import bodies
 from benchmarks.effort import FULL, QUICK, Effort
 from benchmarks.iteration import iteration
+from benchmarks.libraries import libraries, products
 from benchmarks.measure import Figure
 from benchmarks.memory import memory
 from benchmarks.model import ensemble, imagination
 from benchmarks.rivals import sb3, sbx
 from benchmarks.search import search
-from benchmarks.updates import products, torchrl, update
+from benchmarks.updates import torchrl, update
 from recipes.machine import available_cores, prepare
 
 Row = Literal[
-    "products", "update", "torchrl", "sb3", "sbx", "ensemble", "imagination", "search", "bodies", "iteration", "memory"
+    "products",
+    "libraries",
+    "update",
+    "torchrl",
+    "sb3",
+    "sbx",
+    "ensemble",
+    "imagination",
+    "search",
+    "bodies",
+    "iteration",
+    "memory",
 ]
 ROWS: dict[Row, Callable[[Effort], list[Figure]]] = {
     "products": products,
+    "libraries": libraries,
     "update": update,
     "torchrl": torchrl,
     "sb3": sb3,

@@ -17,7 +17,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from coim.products import affine, input_gradient, weight_gradient
+from benchmarks.measure import taking
+from coim.products import Choice, affine, chosen, input_gradient, weight_gradient
 
 Kind = Literal["forward", "input", "weight"]
 
@@ -140,7 +141,7 @@ def alone(
     products: Sequence[Product],
     *,
     times: int = 1,
-    library: Literal["mkl", "onednn"] = "mkl",
+    by: Choice | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Callable[[], None]:
     """An action that takes the products, so many times over, and nothing else.
@@ -151,18 +152,19 @@ def alone(
     Args:
         products: in the order in which they are taken.
         times: how often.
-        library: ``"mkl"``, torch.mm into memory that is there already; or ``"onednn"``, `coim.products`, which the
-            library itself uses.
+        by: libraries that `coim.products` lets multiply, as in a learner; None takes torch.mm, into memory that is
+            there already.
         dtype: of all of them.
     """
     operands = _Operands(dtype)
-    calls = [(operands.by_mkl if library == "mkl" else operands.by_onednn)(product) for product in products]
+    calls = [(operands.bare if by is None else operands.of_a_layer)(product) for product in products]
 
     @torch.no_grad()
     def run() -> None:
-        for _ in range(times):
-            for call in calls:
-                call()
+        with taking(by or chosen()):
+            for _ in range(times):
+                for call in calls:
+                    call()
 
     return run
 
@@ -175,7 +177,7 @@ class _Operands:
         self._made: dict[tuple, Tensor] = {}
         self._generator = torch.Generator().manual_seed(0)
 
-    def by_mkl(self, product: Product) -> Callable[[], object]:
+    def bare(self, product: Product) -> Callable[[], object]:
         x, weight, delta = self._of(product)
         kind, rows, inputs, outputs = product.kind, product.rows, product.inputs, product.outputs
         if kind == "forward":
@@ -185,7 +187,7 @@ class _Operands:
         gradient = self._matrix(f"gradient {product.network} {product.layer}", inputs, outputs)
         return partial(torch.mm, x.t(), delta, out=gradient)
 
-    def by_onednn(self, product: Product) -> Callable[[], object]:
+    def of_a_layer(self, product: Product) -> Callable[[], object]:
         x, weight, delta = self._of(product)
         if product.kind == "forward":
             return partial(affine, x, weight, torch.zeros(product.outputs, dtype=self._dtype))

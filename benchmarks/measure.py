@@ -13,6 +13,8 @@ from typing import Any, Literal
 
 import torch
 
+from coim.products import Choice, chosen, use
+
 Times = dict[str, list[float]]
 
 
@@ -38,6 +40,17 @@ def interleaved(actions: Mapping[str, Callable[[], object]], repeats: int, *, wa
 def over(numerator: Sequence[float], denominator: Sequence[float]) -> tuple[float, ...]:
     """Ratios repeat by repeat."""
     return tuple(a / b for a, b in zip(numerator, denominator, strict=True))
+
+
+@contextmanager
+def taking(products: Choice) -> Iterator[None]:
+    """Let these libraries multiply."""
+    before = chosen()
+    use(products)
+    try:
+        yield
+    finally:
+        use(before)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from benchmarks.updates import FLOOR, PRODUCTS_BY
 from coim import HalfCheetahMorph, NoisyDesigns, WorldModelEnv, imagine, make_policy, sample_batches
 from coim.imagination import CHUNK_ROWS
 from coim.learner import Precision
+from coim.products import chosen
 
 
 def ensemble(effort: Effort) -> list[Figure]:
@@ -31,7 +32,7 @@ def ensemble(effort: Effort) -> list[Figure]:
     times = interleaved(
         {
             "floor": alone(listed, times=updates),
-            "onednn": alone(listed, times=updates, library="onednn"),
+            "coim": alone(listed, times=updates, by=chosen()),
             "float32": ours("float32"),
             "float32, not compiled": ours("float32", compile=False),
             "bfloat16": ours("bfloat16"),
@@ -46,7 +47,7 @@ def ensemble(effort: Effort) -> list[Figure]:
             amounts=tuple(1e3 * seconds / updates for seconds in times[name]),
             unit="ms",
             target=Target(1.4) if name == "float32" else None,
-            note=PRODUCTS_BY.format(median(over(times[name], times["onednn"]))) if name == "float32" else "",
+            note=PRODUCTS_BY.format(median(over(times[name], times["coim"]))) if name == "float32" else "",
         )
         for name in ("float32", "float32, not compiled", "bfloat16")
     ]
@@ -65,7 +66,7 @@ def imagination(effort: Effort) -> list[Figure]:
     times = interleaved(
         {
             "floor": alone(listed),
-            "onednn": alone(listed, library="onednn"),
+            "coim": alone(listed, by=chosen()),
             "imagine": lambda: imagine(dream, states, policy, generator, rng=rng),
         },
         effort.repeats,
@@ -78,6 +79,6 @@ def imagination(effort: Effort) -> list[Figure]:
             amounts=tuple(effort.imagined_rows / seconds for seconds in times["imagine"]),
             unit="rows/s",
             target=Target(1.4),
-            note=PRODUCTS_BY.format(median(over(times["imagine"], times["onednn"]))),
+            note=PRODUCTS_BY.format(median(over(times["imagine"], times["coim"]))),
         )
     ]

@@ -22,9 +22,11 @@ from benchmarks.floors import (
     sac_products,
     weight_gradients,
 )
+from benchmarks.libraries import verdict
 from benchmarks.measure import Figure, Target, interleaved, over
 from benchmarks.rivals import RIVALS
 from benchmarks.table import heading, machine, text
+from coim.products import Choice
 
 TINY = Effort(
     repeats=2,
@@ -79,9 +81,9 @@ def test_the_floors_of_the_other_parts_are_what_the_equations_need() -> None:
     assert flop(valued) == 2 * 108 * (policy + 2 * critic)
 
 
-@pytest.mark.parametrize("library", ["mkl", "onednn"])
+@pytest.mark.parametrize("by", [None, Choice("torch", "emulated")])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_floor_takes_every_product(library: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_floor_takes_every_product(by: Choice | None, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     """Counted where the work is done: rows times columns times what is summed over."""
     done = []
 
@@ -95,7 +97,7 @@ def test_a_floor_takes_every_product(library: str, dtype: torch.dtype, monkeypat
     monkeypatch.setattr("benchmarks.floors.input_gradient", lambda delta, weight: product(delta, weight.t()))
     monkeypatch.setattr("benchmarks.floors.weight_gradient", lambda x, delta: product(x.t(), delta))
     listed = sac_products(batch=4, cells=(5, 5), **SIZES)
-    alone(listed, times=3, library=library, dtype=dtype)()
+    alone(listed, times=3, by=by, dtype=dtype)()
     assert sum(done) == 3 * flop(listed)
     assert len(done) == 3 * len(listed)
 
@@ -131,6 +133,12 @@ def test_more_threads_than_cores_are_not_measured() -> None:
     (figure,) = ROWS["torchrl"](dataclasses.replace(TINY, threads=(4096,)))
     assert not figure.ratios
     assert "needs 4096 cores" in figure.note
+
+
+def test_a_library_that_beats_the_chosen_one_is_told() -> None:
+    assert verdict("float32", "torch", {"torch": (1.0, 1.02), "onednn": (1.0, 1.0)}) == "chosen by the table"
+    told = verdict("float32", "torch", {"torch": (1.5, 1.5), "onednn": (1.0, 1.0)})
+    assert told.startswith("THE TABLE IS WRONG HERE: onednn is 1.50 x as fast; mend FASTEST[")
 
 
 def test_actions_take_turns_and_the_first_of_each_does_not_count() -> None:
@@ -173,7 +181,7 @@ def test_the_program_prints_one_table_and_writes_json(
     monkeypatch.setattr("benchmarks.__main__.FULL", TINY)
     monkeypatch.chdir(tmp_path)
     main(Options(only=("products",)))
-    assert "products of an update, 1 thread, oneDNN bfloat16" in capsys.readouterr().out
+    assert "products of an update, 1 thread, bfloat16 emulated" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []  # a part is no result
     main(Options(only=("products",), out=tmp_path / "found" / "part.json"))
     content = json.loads((tmp_path / "found" / "part.json").read_text())
