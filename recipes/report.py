@@ -101,8 +101,7 @@ def in_short(records: Sequence[Record]) -> str:
         note(f"{record.name}: {sentence}") for record in records for sentence in (state(record), *ill(record))
     )
     if len(records) == 1:
-        size = len(records[0].designs[0]["xi"])
-        head = ["run", "best return", "design", "kind", *(f"xi_{i + 1}" for i in range(size))]
+        head = ["run", "best return", "design", "kind", *records[0].design_names]
         rows = [
             [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, row["xi"])]
             for run, row in sorted(records[0].best.items())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -158,7 +159,7 @@ def _with_weighted_entropy(record: Record) -> Record:
         | {f"{who}/alpha_entropy": alpha * row.get(f"{who}/entropy", math.nan) for who in ("individual", "population")}
         for row in record.episodes
     ]
-    return Record(record.name, record.config, rows, record.designs)
+    return replace(record, episodes=rows)
 
 
 def _means(record: Record, column: str) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -52,16 +52,14 @@ def best_returns(records: Sequence[Record]) -> Picture:
 
 def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
     """Each design dimension over the order of building."""
-    size = len(records[0].designs[0]["xi"])
+    names = records[0].design_names
+    size = len(names)
     figure, grid = new_figure(0.6 + 1.7 * math.ceil(size / 2), math.ceil(size / 2), 2, sharex=True)
-    for dimension, axes in enumerate(grid[:size]):
-        column = f"xi_{dimension + 1}"
-        spread = [
-            Record(r.name, r.config, r.episodes, [row | {column: row["xi"][dimension]} for row in r.designs])
-            for r in records
-        ]
-        plot_over_designs(axes, spread, column)
-        axes.set(ylabel=rf"$\xi_{{{dimension + 1}}}$ (scale factor, 1)")
+    for i, (name, axes) in enumerate(zip(names, grid)):
+        spread = [replace(r, designs=[row | {"entry": row["xi"][i]} for row in r.designs]) for r in records]
+        plot_over_designs(axes, spread, "entry")
+        axes.set_title(name, loc="left", fontsize=10)
+        axes.set(ylabel="scale factor (1)")
         if body is not None:
             low, high = body.DESIGN_BOUNDS
             margin = 0.06 * (high - low)
@@ -78,7 +76,7 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
         "" if body is None else f" Dashed: the bounds, {body.DESIGN_BOUNDS[0]:.3g} and {body.DESIGN_BOUNDS[1]:.3g}."
     )
     caption = f"Scale factors of the body, 1 as drawn.{bounds}"
-    return Picture("Designs over time", caption, f"{size} scale factors of the body over designs.{bounds}", figure)
+    return Picture("Designs over time", caption, f"Scale factors over designs: {', '.join(names)}.{bounds}", figure)
 
 
 def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:

@@ -15,6 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from coim.envs import BODIES
+from recipes.results import DESIGN_PREFIX, entry_of_column
+
 Row = dict[str, Any]
 WORDS = ("kind", "diverged")  # cells that are not numbers
 COUNTS = ("run", "design", "episode", "env_steps")
@@ -30,12 +33,14 @@ class Record:
         episodes: rows of ``evaluations.csv``, each with the cells that ``metrics.csv`` has for it.
         designs: a row per run and design, also of those under way: run, design, kind, xi, best_return, predicted,
             diverged, and whether it is finished, which it is not where the run diverged.
+        design_names: of the entries of ``xi``, as the columns have them; where an older folder counts them, the body's.
     """
 
     name: str
     config: dict[str, Any]
     episodes: list[Row]
     designs: list[Row]
+    design_names: tuple[str, ...]
 
     @property
     def environment(self) -> str:
@@ -141,7 +146,8 @@ def read_record(folder: Path, name: str) -> Record:
         raise ValueError(f"{folder / 'evaluations.csv'} has no rows; wait for the first episode of the run")
     metrics = {_place(row): row for row in read_rows(folder / "metrics.csv")}
     episodes = [row | metrics.get(_place(row), {}) for row in episodes]
-    return Record(name, config, episodes, best_of_designs(episodes, read_rows(folder / "designs.csv")))
+    designs = best_of_designs(episodes, read_rows(folder / "designs.csv"))
+    return Record(name, config, episodes, designs, design_names(folder / "evaluations.csv", config["environment"]))
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -156,15 +162,27 @@ def read_rows(path: Path) -> list[Row]:
     return [_typed(row) for row in csv.DictReader(whole) if None not in row.values()]
 
 
+def design_names(path: Path, environment: str) -> tuple[str, ...]:
+    """Names of the entries of a design, from the columns of a table; the body's where they are counted there."""
+    with path.open(newline="") as file:
+        columns = [name for name in next(csv.reader(file)) if name.startswith(DESIGN_PREFIX)]
+    body = BODIES.get(environment)
+    if body is not None and len(columns) == body.DESIGN_SIZE:
+        known = body.design_names()
+    else:
+        known = tuple(f"design {i}" for i in range(len(columns)))
+    return tuple(entry_of_column(column) or name for column, name in zip(columns, known))
+
+
 def _typed(cells: dict[str, str]) -> Row:
-    design = tuple(float(cell) for key, cell in cells.items() if key.startswith("xi_"))
+    design = tuple(float(cell) for key, cell in cells.items() if key.startswith(DESIGN_PREFIX))
     row: Row = {"xi": design} if design else {}
     for key, cell in cells.items():
         if key in WORDS:
             row[key] = cell
         elif key in COUNTS:
             row[key] = int(cell)
-        elif not key.startswith("xi_"):
+        elif not key.startswith(DESIGN_PREFIX):
             row[key] = _number(cell)
     return row
 

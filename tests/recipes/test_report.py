@@ -192,6 +192,32 @@ def test_bodies_that_are_not_ours_are_not_drawn(runs: Path, tmp_path: Path) -> N
     assert len(check(write_report([folder], body=HopperMorph)).images) == len(PICTURES)
 
 
+@pytest.mark.parametrize(
+    ("columns", "environment", "names"),
+    [
+        (("xi_torso", "xi_thigh", "xi_shank", "xi_foot"), "giraffe", ("torso", "thigh", "shank", "foot")),
+        (("xi_1", "xi_2", "xi_3", "xi_4"), "hopper", ("torso", "thigh", "shank", "foot")),
+        (("xi_1", "xi_2", "xi_3", "xi_4"), "giraffe", ("design 0", "design 1", "design 2", "design 3")),
+    ],
+)
+def test_entries_of_a_design_have_the_names_of_the_columns_or_of_the_body(
+    runs: Path, tmp_path: Path, columns: tuple[str, ...], environment: str, names: tuple[str, ...]
+) -> None:
+    folder = shutil.copytree(runs / "one", tmp_path / "run")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"environment": environment}))
+    for name in ("evaluations.csv", "designs.csv"):
+        head, *rows = (folder / name).read_text().splitlines()
+        head = head.replace("xi_torso,xi_thigh,xi_shank,xi_foot", ",".join(columns))
+        (folder / name).write_text("\n".join([head, *rows]) + "\n")
+    record = read_record(folder, "")
+    assert record.design_names == names
+    assert record.designs[0]["xi"] == (1, 1, 1, 1)
+    page = check(write_report([folder]))
+    assert all(name in page.words for name in names)
+    assert any(f"Scale factors over designs: {', '.join(names)}." in image["alt"] for image in page.images)
+
+
 def test_names_are_words_and_neither_tags_nor_formulas(runs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(runs / "one", tmp_path / "a <b> & 'c\"")
     formula = shutil.copytree(runs / "one", tmp_path / "_$x_{1$")
