@@ -94,7 +94,7 @@ class DynamicsLearner:
         self.ensemble.update_statistics(self._taken(rows))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that coming updates depend on: weights, moments, statistics. Tensors are not copied."""
+        """Return what learning has changed: weights, moments, statistics. Tensors are not copied."""
         return {
             "weights": self._weights.detach(),
             "moments": dict(self.optimiser.state.get(self._weights, {})),

@@ -46,29 +46,31 @@ class FlatUpdates:
 
     def mean(self, batches: Iterable[Sequence[Tensor]]) -> Tensor:
         """Do one update with the tensors of each batch; returns the mean of what the updates return."""
+        batches = list(batches)
+        sizes = [tensor.shape for tensor in batches[0]]
         self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
         if self._captures:
-            self._renew()
+            self._renew(sizes)
         with torch.cuda.device_of(self._weights):  # a graph is captured on the current device
             mean = torch.stack([self._step(*rows) for rows in batches]).mean(0)
         if self._captures:
-            self._captured = self._constants()
+            self._captured = self._constants(sizes)
         return mean
 
-    def _renew(self) -> None:
-        """Write a new learning rate where the graph reads it; drop a graph whose other settings or moments are old."""
+    def _renew(self, sizes: list[torch.Size]) -> None:
+        """Write a new learning rate where the graph reads it; drop a graph of other sizes, settings or moments."""
         group = self.optimiser.param_groups[0]
         if group["lr"] is not self._lr:
             self._lr.copy_(torch.as_tensor(group["lr"]))  # type: ignore[union-attr]
             group["lr"] = self._lr
-        if self._captured != self._constants():
+        if self._captured != self._constants(sizes):
             self._step = CudaGraphModule(self._update, device=self._weights.device)
 
-    def _constants(self) -> tuple[list[int], dict[str, Any]]:
-        """What a graph takes for granted: where the moments lie, and the optimiser's settings but the learning rate."""
+    def _constants(self, sizes: list[torch.Size]) -> tuple[Any, ...]:
+        """What a graph takes for granted: sizes, where the moments lie, the settings but for the learning rate."""
         moments = [moment.data_ptr() for moment in self.optimiser.state.get(self._weights, {}).values()]
         settings = self.optimiser.param_groups[0].items()
-        return moments, {name: value for name, value in settings if name not in ("params", "lr")}
+        return sizes, moments, {name: value for name, value in settings if name not in ("params", "lr")}
 
 
 def captures(device: torch.device) -> bool:

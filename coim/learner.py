@@ -64,8 +64,8 @@ class SACLearner:
             policy and critics scale their inputs differently.
 
     Note:
-        On CUDA an update is captured once as a CUDA graph and replayed: all batches must have one size there, and
-        wherever the gradients are compiled.
+        On CUDA an update is captured as a CUDA graph and replayed, until batches have another size.  Where the
+        gradients are compiled, all batches must have one size.
 
         Moving the modules to another device or dtype afterwards, or giving them to another learner, parts them from the
         flat buffers; `update` refuses that.
@@ -127,7 +127,7 @@ class SACLearner:
                 moment.zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that coming updates depend on: weights, targets, moments, generator. Tensors are not copied."""
+        """Return what learning has changed: weights, targets, moments, generator. Tensors are not copied."""
         moments = dict(self.optimiser.state.get(self._weights, {}))
         weights, targets = self._weights.detach(), self._targets
         return {"weights": weights, "targets": targets, "moments": moments, "rng": self.rng.get_state()}

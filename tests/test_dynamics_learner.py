@@ -142,6 +142,25 @@ def test_what_a_buffer_samples_is_one_update(make_rows: Rows, num_runs: int | No
     assert torch.equal(flat.state_dict()["weights"], explicit.state_dict()["weights"])
 
 
+def test_torchs_defaults_change_nothing(make_rows: Rows) -> None:
+    batches = make_rows(2, 8, dtype=torch.float32)
+    updated = []
+    for device, dtype in (("cpu", torch.float32), ("meta", torch.float64)):
+        ensemble = ensemble_on(batches, dtype=torch.float32)
+        torch.set_default_dtype(dtype)
+        try:
+            with torch.device(device):
+                learner = DynamicsLearner(ensemble)
+                learner.observe(batches)
+                updated.append([learner.update(batches)["loss_dynamics"], learner.error(batches)])
+                updated[-1].append(learner.loss(batches)["loss_dynamics"])
+        finally:
+            torch.set_default_dtype(torch.float32)
+    for value, expected in zip(*updated, strict=True):
+        assert value.dtype == torch.float32
+        assert torch.equal(value, expected)
+
+
 @pytest.mark.parametrize("name", ["update", "observe", "error"])
 def test_a_change_over_several_steps_is_refused(make_rows: Rows, name: str) -> None:
     rows = make_rows(8, 1)

@@ -151,6 +151,14 @@ def test_updates_are_captured_once_on_the_device_of_the_weights(
     assert [recording.device for recording in recordings] == [torch.device("cpu")]
 
 
+@pytest.mark.parametrize("make", [sac_learner, dynamics_learner])
+def test_batches_of_another_size_are_captured_anew(make_rows: Rows, recordings: list[Recording], make: Any) -> None:
+    learner = make()
+    for size in (8, 1, 8):  # a graph's copy of its input would repeat the one row eight times
+        learner.update(make_rows(3, size, 1))
+    assert [recording.rows[0].shape[-2] for recording in recordings] == [8, 1, 8]
+
+
 def test_updates_are_captured_on_cuda_alone() -> None:
     assert coim.flat.captures(torch.device("cuda", 1))
     assert not coim.flat.captures(torch.device("cpu"))

@@ -164,6 +164,26 @@ def test_rows_that_only_the_loss_understands_are_refused(make_rows: Rows) -> Non
         learner.update(make_rows(8).set("priority_weight", torch.ones(8)))
 
 
+@pytest.mark.parametrize("num_runs", [None, 2])
+def test_torchs_defaults_change_nothing(make_rows: Rows, num_runs: int | None) -> None:
+    batches = make_rows(2, 8, *([num_runs] if num_runs else []), dtype=torch.float32)
+    updated = []
+    for device, dtype in (("cpu", torch.float32), ("meta", torch.float64)):
+        torch.manual_seed(0)
+        policy = make_policy(ToyEnv(), num_cells=(8,), num_runs=num_runs)
+        qvalue = make_qvalue(ToyEnv(), num_cells=(8,), num_runs=num_runs)
+        torch.set_default_dtype(dtype)
+        try:
+            with torch.device(device):
+                learner = SACLearner(policy, qvalue, num_runs=num_runs, mix="sum")
+                updated.append(dict(learner.update(batches).items()) | weights(learner))
+                assert learner.loss(batches)["loss_actor"].dtype == torch.float32
+        finally:
+            torch.set_default_dtype(torch.float32)
+    for key, value in updated[0].items():
+        assert torch.equal(updated[1][key], value), key
+
+
 @pytest.mark.parametrize("name", ["policy", "qvalue"])
 def test_a_saved_network_is_that_network_alone(make_rows: Rows, name: str) -> None:
     def saved(state: dict[str, torch.Tensor]) -> int:
