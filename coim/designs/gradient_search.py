@@ -81,7 +81,8 @@ class GradientSearch:
         """
         # Adam moves in the unit cube, where one step means the same for every entry.
         scale = self._high - self._low
-        place = torch.rand(self.num_starts, len(scale), generator=self._rng, dtype=scale.dtype).to(scale.device)
+        starts = torch.rand(self.num_starts, len(scale), generator=self._rng, dtype=scale.dtype, device="cpu")
+        place = starts.to(scale.device)
         climber = torch.optim.Adam([place], lr=self.lr, maximize=True)
         best, best_value = self._low, -torch.inf
         for step in range(self.num_steps):

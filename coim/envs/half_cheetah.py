@@ -135,8 +135,8 @@ class HalfCheetahMorph(MorphEnv):
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Reset noise of one row for ``reset_noise=1``: uniform positions in [-1, 1], normal velocities (Gymnasium)."""
-        positions = 2 * torch.rand(num_positions, generator=generator, dtype=torch.float64) - 1
-        return positions, torch.randn(num_velocities, generator=generator, dtype=torch.float64)
+        positions = 2 * torch.rand(num_positions, generator=generator, dtype=torch.float64, device="cpu") - 1
+        return positions, torch.randn(num_velocities, generator=generator, dtype=torch.float64, device="cpu")
 
     @staticmethod
     def reward(

@@ -1,0 +1,239 @@
+"""A fleet of bodies on tensors: what is built, placed, moved and looked at, without TorchRL.
+
+Shapes: K runs (rows of the fleet), S observation, D design, A action. Everything is on the CPU in here.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from pathlib import Path
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from coim.envs.camera import Camera
+from coim.envs.planar import check_planar
+from coim.envs.simulation import PITCH, ROOT_X, Simulations
+from coim.randomness import restore_generator
+
+
+class Fleet:
+    """The bodies of :class:`~coim.envs.morph.MorphEnv`: constants and :meth:`shape_body` say which.
+
+    Attributes:
+        simulations: the native fleet: live positions, velocities and compiled bodies, for whoever looks beneath.
+        num_broken: how often each row's simulation broke so far, ``[K]`` int64.
+    """
+
+    ASSET: ClassVar[str]  # XML file in assets/, or an absolute path
+    DESIGN_SIZE: ClassVar[int]
+    DESIGN_NAMES: ClassVar[tuple[str, ...]] = ()  # of the design's entries; see design_names()
+    DESIGN_BOUNDS: ClassVar[tuple[float, float]]
+    FRAME_SKIP: ClassVar[int]  # simulation steps in an environment step
+    RESET_NOISE: ClassVar[float]
+    OBSERVATION_SCALE: ClassVar[tuple[float, ...]]  # standard deviations under random actions at xi = 1, rounded
+    FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]]  # that a recipe's run tries first
+
+    _first_position = 1  # of qpos in the observation: the root's x is left out
+
+    reset_noise: float
+
+    def _begin(self, num_runs: int, num_threads: int) -> None:
+        """Build K unit bodies."""
+        self._num_threads = num_threads
+        self._design = torch.ones(num_runs, self.DESIGN_SIZE, dtype=torch.float32, device="cpu")
+        self.simulations = self._simulate()
+        check_planar(self.simulations.model(0), type(self).__name__)
+        self._observation = self._see()
+        self._step_count = torch.zeros(num_runs, 1, dtype=torch.int64, device="cpu")
+        self.num_broken = torch.zeros(num_runs, dtype=torch.int64, device="cpu")
+
+    def _simulate(self) -> Simulations:
+        """A fleet of the present designs."""
+        return Simulations(
+            mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / self.ASSET)),
+            shape_body=self.shape_body,
+            designs=self._design.numpy(),
+            num_threads=self._num_threads,
+        )
+
+    @abstractmethod
+    def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
+        """Turn the body as drawn into the body of a design, in place.
+
+        Args:
+            spec: the body as drawn, xi = 1.
+            design: scale factors within the bounds, ``[D]`` float64.
+        """
+
+    def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Reset noise of one row for ``reset_noise=1``: uniform in [-1, 1], positions and velocities, float64."""
+        size = num_positions + num_velocities
+        noise = 2 * torch.rand(size, generator=generator, dtype=torch.float64, device="cpu") - 1
+        return noise[:num_positions], noise[num_positions:]
+
+    def move(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Step the fleet on tensors, without a reward.
+
+        Args:
+            action: motor torques as shares of the motors' strength, ``[K, A]``; MuJoCo clips them to [-1, 1].
+
+        Returns:
+            Next observation ``[K, S]`` and whether the simulation broke ``[K, 1]``, on the action's device: actions on
+            the CPU step the fleet without a word to another device.
+
+        Raises:
+            ValueError: the action has another shape or a number that is not finite; nothing has moved then.
+        """
+        device, action = action.device, action.detach().cpu()
+        if action.shape != self.simulations.ctrl.shape:
+            raise ValueError(
+                f"action has shape {list(action.shape)}, the fleet takes {list(self.simulations.ctrl.shape)}"
+            )
+        torques = action.numpy()
+        if not math.isfinite(torques.sum()):
+            raise ValueError(f"action {action.tolist()} is not finite; the policy that gave it has diverged")
+        self.simulations.ctrl[:] = torques
+        broken = self.simulations.step(self.FRAME_SKIP)
+        observation = self._see()
+        terminated = torch.zeros(len(action), 1, dtype=torch.bool, device="cpu")
+        if broken.size:
+            observation[broken] = self._observation[broken]
+            terminated[broken] = True
+            self.num_broken[broken] += 1
+        self._observation = observation.clone()  # ours; what is handed out may be written to
+        self._step_count += 1
+        return observation.to(device), terminated.to(device)
+
+    def place(self, observation: Tensor, design: Tensor) -> None:
+        """Set all simulations to a state and a body each, to compare a learnt model with the truth.
+
+        Args:
+            observation: ``[K, S]``; a root x that it does not hold becomes 0.
+            design: ``[K, D]``.
+
+        Raises:
+            ValueError: a wrong shape, a number that is not finite, or a design out of bounds.
+
+        Note:
+            The solver's warm start is no part of an observation: the next step agrees with the one that was once seen
+            from here to the precision of float32, not to the last bit.
+        """
+        state = observation.detach().cpu().double().numpy()
+        if state.shape != self._observation.shape or not np.isfinite(state).all():
+            raise ValueError(
+                f"observation must be finite and of shape {list(self._observation.shape)}, got {observation}"
+            )
+        rows = np.arange(len(state))
+        self._build(design, rows)
+        self.simulations.start(rows)
+        qpos, qvel = self.simulations.qpos, self.simulations.qvel
+        num_positions = qpos.shape[1] - self._first_position
+        qpos[:, ROOT_X] = 0.0
+        qpos[:, self._first_position :] = state[:, :num_positions]
+        qvel[:] = state[:, num_positions:]
+        self._step_count.zero_()
+        self._observation = self._see()
+
+    def get_simulation_state(self) -> TensorDict:
+        """All that the coming steps and resets depend on, ``[K]``: bodies, simulations, generators, counters.
+
+        Rows of it may be loaded into another fleet, which goes on as these rows would have, to the last bit.
+        """
+        state = {
+            "design": self._design,
+            "observation": self._observation,
+            "simulation": torch.from_numpy(self.simulations.state),
+            "generator": torch.stack([generator.get_state() for generator in self._generators]),
+            "step_count": self._step_count,
+            "num_broken": self.num_broken,
+        }
+        return TensorDict(state, [len(self._design)], device="cpu").clone()
+
+    def set_simulation_state(self, state: TensorDictBase) -> None:
+        """Go on from where :meth:`get_simulation_state` was called.
+
+        Raises:
+            ValueError: the state is one of another number of runs.
+        """
+        if state.batch_size != self._design.shape[:1]:
+            raise ValueError(
+                f"the state holds {state.numel()} runs, this fleet has {len(self._design)}; index it to select some"
+            )
+        state = state.clone().cpu()
+        self._build(state["design"], np.arange(len(self._design)))
+        self.simulations.state[:] = state["simulation"].numpy()
+        for generator, generator_state in zip(self._generators, state["generator"]):
+            restore_generator(generator, generator_state)
+        self._observation, self._step_count, self.num_broken = (
+            state[key] for key in ("observation", "step_count", "num_broken")
+        )
+
+    def capsules(self, run: int = 0) -> Tensor:
+        """Outline of one row as it stands, ``[segments, 5]``: x and z of both ends and the radius, in m."""
+        return torch.from_numpy(self.simulations.capsules(run))
+
+    def render(self, run: int = 0, *, width: int = 480, height: int = 360) -> np.ndarray:
+        """A picture of one row as it stands, ``[height, width, 3]`` uint8, about 0.1 s without a graphics card.
+
+        Raises:
+            RuntimeError: there is no OpenGL; the sentence says what to set and install.
+        """
+        with self.camera(run, width=width, height=height) as camera:
+            return camera.photograph(self.simulations.qpos[run])
+
+    def camera(self, run: int = 0, *, width: int = 480, height: int = 360) -> Camera:
+        """A camera for many pictures of one row's present body, from any ``simulations.qpos``; see :meth:`render`."""
+        return Camera(self.simulations.body(self._design[run].numpy()), width=width, height=height)
+
+    @property
+    def step_seconds(self) -> float:
+        """What a step takes in the simulated world, in s."""
+        return self.FRAME_SKIP * self.simulations.model(0).opt.timestep
+
+    def _seed_rows(self, seed: int) -> None:
+        """Give every row a generator of its own, derived from (seed, row)."""
+        rows = range(len(self._design))
+        words = [np.random.SeedSequence([seed, row]).generate_state(1, np.uint32)[0] for row in rows]
+        self._generators = [torch.Generator("cpu").manual_seed(int(word)) for word in words]
+
+    def _build(self, design: Tensor, rows: np.ndarray) -> None:
+        """Check the designs of the given rows, ``design [K, D]``, and build those that are new."""
+        if design.shape != self._design.shape:
+            raise ValueError(f"design has shape {list(design.shape)}, this fleet takes {list(self._design.shape)}")
+        wanted = design.detach().to("cpu", torch.float32)[rows]
+        low, high = torch.tensor(self.DESIGN_BOUNDS, dtype=torch.float32, device="cpu")
+        if not bool(((wanted >= low) & (wanted <= high)).all()):  # NaN is neither
+            raise ValueError(
+                f"design {wanted.tolist()} leaves [{low:.4g}, {high:.4g}]; clip it with design_spec.project()"
+            )
+        changed = (wanted != self._design[rows]).any(-1).numpy()
+        if changed.any():
+            self.simulations.build(rows[changed], wanted[changed].numpy())
+            self._design[rows] = wanted
+
+    def _start(self, rows: np.ndarray) -> None:
+        """Begin new episodes: the start pose of each body, noise from the row's own generator, no foot in the floor."""
+        simulations = self.simulations
+        simulations.start(rows)
+        for row in rows:
+            positions, velocities = self.draw_noise(
+                simulations.qpos.shape[1], simulations.qvel.shape[1], self._generators[row]
+            )
+            simulations.qpos[row] += self.reset_noise * positions.numpy()
+            simulations.qvel[row] += self.reset_noise * velocities.numpy()
+            simulations.lift_out_of_floor(row)
+        self._step_count[rows] = 0
+        self._observation[rows] = self._see()[rows]
+
+    def _see(self) -> Tensor:
+        """The observation ``[K, S]`` of the simulations as they stand: ``qpos, qvel`` with the pitch wrapped."""
+        state = np.concatenate((self.simulations.qpos[:, self._first_position :], self.simulations.qvel), axis=1)
+        pitch = state[:, PITCH - self._first_position]
+        pitch -= math.tau * np.ceil(pitch / math.tau - 0.5)  # wrap_angle, before precision is lost to float32
+        return torch.from_numpy(state.astype(np.float32))
