@@ -61,7 +61,7 @@ def imagination(effort: Effort) -> list[Figure]:
     states, generator = random_rows(effort.imagined_rows), NoisyDesigns(env.design_spec, sigma=0.1)
     rng = torch.Generator().manual_seed(0)
     sizes: dict[str, Any] = body_sizes(env)
-    chunks = [len(chunk) for chunk in torch.arange(effort.imagined_rows).split(CHUNK_ROWS)]
+    chunks = [len(chunk) for chunk in torch.arange(effort.imagined_rows).split(CHUNK_ROWS["cpu"])]
     listed = imagination_products(chunks=chunks, cells=effort.num_cells, model_cells=effort.model_cells, **sizes)
     times = interleaved(
         {

@@ -19,8 +19,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from coim.designs import DesignGenerator
 from coim.envs.world_model import WorldModelEnv
 
-# Larger products no longer fit the cache of a CPU core and gain nothing.
-CHUNK_ROWS = 3000
+# On a CPU, larger products no longer fit the cache of a core and gain nothing; elsewhere a chunk shall fit the memory.
+CHUNK_ROWS = {"cpu": 3_000}
+MANY_ROWS = 100_000
 
 
 @torch.no_grad()
@@ -41,8 +42,8 @@ def imagine(
         policy: any module that reads ``observation`` and ``design`` and writes ``action``; it is sampled, not asked for
             its mean.
         generator: G, the designs that the rows are imagined with.
-        rng: of all that is drawn here, on the states' device; torch's global generator stays as it is. Without it G and
-            the policy draw from the global generator and the dream from its own.
+        rng: of all that is drawn here, on the states' device; torch's global generators stay as they are. Without it G
+            and the policy draw from the global generator and the dream from its own.
 
     Returns:
         Rows ``[N]`` or ``[N, K]`` with the schema of the buffers, without gradients; nothing is terminated. The next
@@ -68,8 +69,9 @@ def imagine(
     if missing or not states.batch_size.numel():
         lack = f"lack {sorted(missing)}" if missing else f"have batch size {list(states.batch_size)}"
         raise ValueError(f"the states to imagine from {lack}; sample rows of Replay_Pop")
-    rows_per_state = states.batch_size[1:].numel()
-    chunks = states.select("observation", "design").split(max(1, CHUNK_ROWS // rows_per_state))
+    device, rows_per_state = states["observation"].device, states.batch_size[1:].numel()
+    size = CHUNK_ROWS.get(device.type, MANY_ROWS)
+    chunks = states.select("observation", "design").split(max(1, size // rows_per_state))
     with _drawing_from(rng), set_exploration_type(ExplorationType.RANDOM):
         return torch.cat([_imagine_chunk(dream, chunk, policy, generator, rng) for chunk in chunks])
 

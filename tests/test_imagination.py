@@ -100,12 +100,20 @@ def test_policy_dynamics_and_row_all_see_the_generated_design() -> None:
 
 def test_large_batches_go_in_chunks_that_change_nothing_else() -> None:
     dream = Dream()
-    imagine(as_dream(dream), make_states(2 * CHUNK_ROWS + 1), make_policy(), KnownDesigns())
-    assert dream.asked == [(CHUNK_ROWS,), (CHUNK_ROWS,), (1,)]
+    size = CHUNK_ROWS["cpu"]
+    imagine(as_dream(dream), make_states(2 * size + 1), make_policy(), KnownDesigns())
+    assert dream.asked == [(size,), (size,), (1,)]
     dream.asked.clear()
     rows = imagine(as_dream(dream), make_states(2000, 3), make_policy(), KnownDesigns())
     assert dream.asked == [(1000, 3), (1000, 3)]
     assert torch.equal(rows["observation"], make_states(2000, 3)["observation"])
+
+
+def test_devices_without_a_cache_to_keep_take_large_batches_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(CHUNK_ROWS, "cpu")  # as any other device
+    dream = Dream()
+    imagine(as_dream(dream), make_states(2_500, 3), make_policy(), KnownDesigns())
+    assert dream.asked == [(2_500, 3)]
 
 
 def test_a_generator_of_random_numbers_decides_everything_and_the_global_one_stays() -> None:

@@ -202,7 +202,7 @@ class GaussianEnsemble(TensorDictModuleBase):
             design: ``[*B, (K,) D]``.
             members: index of the member of each transition, ``[*B, (K)]``; drawn if None.
             noise: standard normal, ``[*B, (K,) S]``; drawn if None.  Zeros give the mean of the member.
-            generator: source of both draws, torch's global one if None.
+            generator: source of both draws, on any device; torch's global one if None.
 
         Returns:
             ``[*B, (K,) S]``.
@@ -211,12 +211,14 @@ class GaussianEnsemble(TensorDictModuleBase):
             IndexError: if a member index is not in ``0 .. E - 1``.
         """
         batch, device = observation.shape[:-1], observation.device
+        source = device if generator is None else generator.device
         if members is None:
-            members = torch.randint(self.num_members, batch, generator=generator, device=device)
+            members = torch.randint(self.num_members, batch, generator=generator, device=source).to(device)
         elif not ((members >= 0) & (members < self.num_members)).all():
             raise IndexError(f"members must lie in 0 .. {self.num_members - 1}, got {members.unique().tolist()}")
         if noise is None:
-            noise = torch.randn(observation.shape, generator=generator, device=device, dtype=observation.dtype)
+            noise = torch.randn(observation.shape, generator=generator, device=source, dtype=observation.dtype)
+            noise = noise.to(device)
         inputs = self.inputs(torch.cat([observation, action, design], -1))
         mean, log_var = self._grouped(inputs, members).chunk(2, -1)
         target = mean + (self._bounded(log_var) / 2).exp() * noise

@@ -8,12 +8,18 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Self
+
 import torch
 from torch import Tensor, nn
 
 
 class RunningNormaliser(nn.Module):
     """Mean and standard deviation of all rows ever seen, feature by feature, in float64.
+
+    ``.to`` moves it to another device and leaves it in float64, whatever dtype is asked for: a count in bfloat16 ends
+    at 256.
 
     Args:
         num_features: ``F``.
@@ -44,7 +50,7 @@ class RunningNormaliser(nn.Module):
         self.register_buffer("mean", torch.zeros(shape, dtype=torch.float64))
         self.register_buffer("square_sum", torch.zeros(shape, dtype=torch.float64))
         floor = torch.zeros(num_features) if min_std is None else min_std
-        self.register_buffer("min_std", floor.to(torch.float64).expand(shape).clone())
+        self.register_buffer("min_std", floor.to(self.mean).expand(shape).clone())
 
     @property
     def std(self) -> Tensor:
@@ -77,6 +83,13 @@ class RunningNormaliser(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Standardise ``[*B, (K,) F]``, in the dtype of ``x``."""
         return (x - self.mean.to(x.dtype)) / self.std.to(x.dtype)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Follow to another device, not to another dtype."""
+        for name, statistics in list(self.named_buffers()):
+            moved = fn(statistics)
+            self.register_buffer(name, moved if moved.dtype == statistics.dtype else statistics.to(moved.device))
+        return self
 
     def keep_run(self, run: int) -> None:
         """Drop all runs but one, in place; see :func:`~coim.models.select_run`."""

@@ -87,6 +87,25 @@ def test_the_same_generator_seed_gives_the_same_sample(make_rows):
     assert not torch.equal(first, third)
 
 
+def test_a_generator_may_be_on_another_device_than_the_model(monkeypatch):
+    ensemble = GaussianEnsemble(3, 2, 2, num_cells=(8,), predict="next").to("meta")
+    seen = []
+    monkeypatch.setattr(ensemble, "_grouped", lambda x, members: seen.append(members) or x.new_zeros(9, 6))
+    x = [torch.zeros(9, size, device="meta") for size in (3, 2, 2)]
+    generator, expected = (torch.Generator().manual_seed(0) for _ in range(2))
+    assert ensemble.sample(*x, generator=generator).device.type == seen[0].device.type == "meta"
+    torch.randint(3, (9,), generator=expected)
+    torch.randn(9, 3, generator=expected)
+    assert torch.equal(generator.get_state(), expected.get_state())
+
+
+def test_statistics_survive_half_precision(make_rows):
+    ensemble = GaussianEnsemble(3, 2, 2, num_cells=(8,)).to(torch.bfloat16)
+    ensemble.update_statistics(make_rows(3_000))
+    assert ensemble.inputs.count.item() == ensemble.targets.count.item() == 3_000
+    assert ensemble.network.layers[0].weight.dtype == torch.bfloat16
+
+
 @pytest.mark.parametrize("runs", [None, 2])
 @pytest.mark.parametrize("predict", ["delta", "next"])
 def test_grouping_gives_what_evaluating_all_members_and_gathering_gives(make_rows, runs, predict):

@@ -63,3 +63,21 @@ def test_a_feature_that_never_varied_is_scaled_by_its_floor_if_it_has_one():
     normaliser = RunningNormaliser(2, min_std=torch.tensor([0.5, 0.0]))
     normaliser.update(torch.ones(10, 2))
     assert normaliser.std.tolist() == [0.5, 1.0]
+
+
+@pytest.mark.parametrize("move", [lambda n: n.to(torch.bfloat16), lambda n: n.half(), lambda n: n.float()])
+def test_statistics_stay_exact_in_every_dtype(move):
+    normaliser = move(RunningNormaliser(2, num_runs=3, min_std=torch.tensor([0.1, 0.0])))
+    for _ in range(3):
+        normaliser.update(torch.ones(1000, 3, 2, dtype=torch.bfloat16))
+    assert normaliser.count.tolist() == [[3000.0]] * 3
+    assert {buffer.dtype for buffer in normaliser.buffers()} == {torch.float64}
+    assert normaliser(torch.ones(3, 2, dtype=torch.bfloat16)).dtype == torch.bfloat16
+
+
+def test_statistics_move_to_another_device_as_one():
+    normaliser = RunningNormaliser(2).to("meta", torch.bfloat16)
+    assert {(buffer.device.type, buffer.dtype) for buffer in normaliser.buffers()} == {("meta", torch.float64)}
+    with torch.device("meta"):
+        normaliser = RunningNormaliser(2, min_std=torch.zeros(2, device="cpu"))
+    assert {buffer.device.type for buffer in normaliser.buffers()} == {"meta"}
