@@ -119,7 +119,8 @@ class Checkpoints:
 
     def _read(self, path: Path) -> dict[str, Any]:
         notes, held = read_notes(path), {"algorithm": Held(), "best": Held()}
-        parts(held, {}).load(path)
+        # Each part moves what it takes to where it lives, which may not be where it lived: a GPU that is not here.
+        parts(held, {}).load(path, map_location="cpu")
         rows = self._replay.read(notes["replay"])
         steps = self.algorithm.env.episode_steps
         self.algorithm.load_state_dict(with_replay(held["algorithm"].state, rows, steps))
@@ -144,7 +145,18 @@ def refuse_lost_checkpoints(folder: Path) -> None:
 
 def parts(states: Mapping[str, Any], notes: dict[str, Any]) -> Checkpoint:
     """What a checkpoint consists of: states, and the generators that everybody shares."""
-    return state_parts({**states, "random": GlobalRNGState()}, notes)
+    return state_parts({**states, "random": SharedRandom()}, notes)
+
+
+class SharedRandom(GlobalRNGState):
+    """Generators that everybody in this process shares. Those of devices that it does not use are not read."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        own = self.state_dict()
+        known = {name: state for name, state in state_dict.items() if name in own}
+        if "torch_cuda" in known:  # a list, a state for each GPU
+            known["torch_cuda"] = known["torch_cuda"][: len(own["torch_cuda"])]
+        super().load_state_dict(known)
 
 
 def without_replay(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -28,8 +28,8 @@ from recipes.parts import build
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
-from recipes.results import Results, default_folder, refuse_filled, versions
-from recipes.settings import QUICK, Settings, parse, read_config, saved_settings
+from recipes.results import Results, folder_of, refuse_filled, versions
+from recipes.settings import ELSEWHERE, QUICK, Settings, parse, read_config, saved_settings
 from recipes.wandb_log import WandbLog
 
 
@@ -79,19 +79,20 @@ def train(
     """
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
-    folder = settings.resume or settings.out or default_folder(name, settings)
     if settings.resume is None:
-        refuse_filled(folder)
+        if settings.out is not None:
+            refuse_filled(settings.out)
         products = choose_products(settings.products)
     else:
-        check_origin(folder, name)
-        refuse_lost_checkpoints(folder)
-        begun = read_config(folder).get("products", FORMERLY._asdict())
-        changed = saved_settings(folder).products != settings.products
+        check_origin(settings.resume, name, settings)
+        refuse_lost_checkpoints(settings.resume)
+        begun = read_config(settings.resume).get("products", FORMERLY._asdict())
+        changed = saved_settings(settings.resume).products != settings.products
         products = choose_products(settings.products, begun=begun, changed=changed)
     if settings.compile:
         check_compiler()
-    algorithm = make(folder, threads, side_by_side)
+    with folder_of(name, settings) as folder:
+        algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
         how = "compiled in the first episode" if settings.compile else "not compiled"
@@ -169,13 +170,13 @@ def forecast_of(algorithm: CoAdaptation, settings: Settings) -> Forecast:
     return Forecast(left, goes_on=settings.resume is not None, quick=quick if shorter else None)
 
 
-def check_origin(folder: Path, name: str) -> None:
-    """Refuse a run of another environment, and warn of other versions than those that it began with."""
+def check_origin(folder: Path, name: str, settings: Settings) -> None:
+    """Refuse a run of another environment, and warn of another machine and other versions than it began with."""
     config = read_config(folder)
     if config["environment"] != name:
         raise ValueError(f"{folder} holds a run of {config['environment']}: python -m recipes.{config['environment']}")
-    present = versions()
-    for package, version in config["versions"].items():
-        if present.get(package) != version:
-            now = present.get(package)
-            print(f"warning: {package} was {version} and is {now}; the numbers may differ from here", file=sys.stderr)
+    now, before = vars(settings) | versions(), vars(saved_settings(folder)) | config["versions"]
+    for what in (*ELSEWHERE, *config["versions"]):
+        if now.get(what) != before[what]:
+            told = f"{what} was {before[what]} and is {now.get(what)}"
+            print(f"warning: {told}; the numbers may differ from here", file=sys.stderr)

@@ -110,14 +110,7 @@ def locked(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("a+")
     except OSError as error:
-        if error.errno in FULL:
-            raise OSError(
-                f"disk full: {folder} cannot be written to; make room there, or name another --out"
-            ) from error
-        first = "make it writable, or " if error.errno in READ_ONLY else ""
-        raise OSError(
-            f"{folder} cannot be written to ({error.strerror}); {first}name another folder for a new run with --out"
-        ) from error
+        raise cannot_write(folder, error) from error
     with lock as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -136,6 +129,16 @@ def locked(folder: Path) -> Iterator[None]:
             file.truncate(0)
             os.write(file.fileno(), f"process {os.getpid()} on {os.uname().nodename}".encode())
         yield
+
+
+def cannot_write(folder: Path, error: OSError) -> OSError:
+    """What to say where a run's folder cannot be made or written to."""
+    if error.errno in FULL:
+        return OSError(f"disk full: {folder} cannot be written to; make room there, or name another one with --out")
+    first = "make it writable, or " if error.errno in READ_ONLY else ""
+    return OSError(
+        f"{folder} cannot be written to ({error.strerror}); {first}name another folder for a new run with --out"
+    )
 
 
 def says_read_only(error: BaseException | None) -> bool:

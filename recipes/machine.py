@@ -7,7 +7,9 @@ import logging
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 
@@ -35,10 +37,23 @@ def checked_device(name: str) -> torch.device:
 
 
 def check_compiler() -> None:
-    """Refuse to compile where there is no C++ compiler, before anything is written."""
+    """Refuse to compile where it cannot work, before anything is written.
+
+    Raises:
+        ValueError: if there is no C++ compiler, or what it makes could not be loaded from where Inductor puts it.
+    """
     asked = os.environ.get("CXX")
     if not any(shutil.which(name) for name in ([asked] if asked else ["g++", "clang++", "c++"])):
         raise ValueError(f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or --no-compile")
+    folder = Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or tempfile.gettempdir()).absolute()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    noexec = hasattr(os, "ST_NOEXEC") and os.statvfs(there).f_flag & os.ST_NOEXEC
+    if noexec or not os.access(there, os.W_OK):
+        why = "is mounted noexec" if noexec else "cannot be written to"
+        raise ValueError(
+            f"compiled code is put into {folder} and loaded from there, which {why}; name another folder by the "
+            "environment variable TORCHINDUCTOR_CACHE_DIR, or --no-compile"
+        )
 
 
 def prepare(threads: int, device: torch.device) -> bool:

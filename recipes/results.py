@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import dataclasses
 import datetime
+import itertools
 import json
 import os
 import platform
 import secrets
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ from typing import Any
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
 from coim.products import chosen
-from recipes.interrupt import LOCK
+from recipes.interrupt import LOCK, cannot_write
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
 from recipes.writing import ASIDE, shortest, telling_full_disk, write_whole
 
@@ -313,7 +316,37 @@ def git_revision() -> str | None:
         return None
 
 
-def default_folder(environment: str, settings: Settings) -> Path:
-    """``runs/ENVIRONMENT-DATE-NAME``; the date has seconds, so that runs started by hand do not collide."""
-    date = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{environment}-{date}-{settings.name}"
+@contextmanager
+def folder_of(environment: str, settings: Settings) -> Iterator[Path]:
+    """The folder of a run: the one that is named, or a new one ``runs/ENVIRONMENT-DATE-NAME``.
+
+    The new one is made at once, and has ``-2``, ``-3``, ... behind its name where another run was quicker. It is taken
+    away again if the run cannot be put together.
+
+    Raises:
+        OSError: if it cannot be made.
+    """
+    if (named := settings.resume or settings.out) is not None:
+        yield named
+        return
+    folder = new_folder(Path("runs") / f"{environment}-{time.strftime('%Y%m%d-%H%M%S')}-{settings.name}")
+    try:
+        yield folder
+    except BaseException:
+        folder.rmdir()
+        raise
+
+
+def new_folder(wanted: Path) -> Path:
+    """Make a folder that nobody else has: the wanted one, or the next free name."""
+    folder = wanted
+    try:
+        wanted.parent.mkdir(parents=True, exist_ok=True)
+        for i in itertools.count(2):
+            with suppress(FileExistsError):
+                folder.mkdir()
+                break
+            folder = wanted.with_name(f"{wanted.name}-{i}")
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    return folder

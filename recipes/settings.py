@@ -150,6 +150,8 @@ QUICK = Settings(
 # What may differ when a run is gone on with, because no number of its past depends on it. Other products round the
 # numbers to come otherwise, as other versions do.
 FREE = {"num_designs", "threads", "products", "checkpoint_every", "resume", "wandb", "quiet"}
+# What a machine may not have on which a run is gone on with. Its numbers differ from there, within rounding at first.
+ELSEWHERE = ("device", "replay_device", "compile")
 # Settings that came later, with a default that is what all runs had before; these may be missing in a run's folder.
 LATER = {"replay_device", "products"}
 # What the parts of a run refuse in their own words, or not at all; here by the option's name and before there is a run.
@@ -283,12 +285,13 @@ def changes(old: Settings, new: Settings) -> dict[str, list[Any]]:
 
 def refuse_changes(old: Settings, new: Settings) -> None:
     """Refuse by name what cannot be changed in the middle of a run."""
-    fixed = {name: values for name, values in changes(old, new).items() if name not in FREE}
+    fixed = {name: values for name, values in changes(old, new).items() if name not in {*FREE, *ELSEWHERE}}
     if fixed:
         told = ", ".join(f"{name} ({was!r} to {wanted!r})" for name, (was, wanted) in fixed.items())
         raise ValueError(
             f"the run in {new.resume} has begun with other settings: {told}; leave them, or start a new run. "
-            f"Free to change are {', '.join(sorted(FREE - {'resume'}))}"
+            f"Free to change are {', '.join(sorted(FREE - {'resume'}))}; with other numbers from there also "
+            f"{', '.join(ELSEWHERE)}"
         )
     if new.num_designs < old.num_designs:
         raise ValueError(

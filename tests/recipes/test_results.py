@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
 
 from coim import DesignChosen, DesignDone, EpisodeDone, HopperMorph, WalkerMorph
-from recipes.results import Results, Table
+from recipes.results import Results, Table, folder_of, new_folder
 from recipes.settings import Settings
 
 
@@ -60,3 +61,30 @@ def test_a_file_whose_design_columns_are_counted_grows_on_under_its_own_header(t
     ):
         with pytest.raises(ValueError, match="has other columns"):
             Table(path, others, keep=1)
+
+
+def test_runs_that_start_in_the_same_second_have_a_folder_each(tmp_path: Path) -> None:
+    wanted = tmp_path / "runs" / "hopper-run"
+    with ThreadPoolExecutor(8) as pool:
+        made = sorted(path.name for path in pool.map(new_folder, [wanted] * 8))
+    assert made == ["hopper-run", *(f"hopper-run-{i}" for i in range(2, 9))]
+    assert sorted(path.name for path in wanted.parent.iterdir()) == made
+
+
+def test_a_run_that_cannot_be_put_together_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with folder_of("hopper", Settings()) as folder:
+        assert [*Path("runs").iterdir()] == [folder]
+    folder.rmdir()
+    with pytest.raises(ZeroDivisionError), folder_of("hopper", Settings()):
+        _ = 1 / 0
+    assert not list(Path("runs").iterdir())
+    with folder_of("hopper", Settings(out=Path("named"))) as named:
+        assert named == Path("named")
+    assert not named.exists()
+
+
+def test_a_place_for_runs_that_is_none_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "runs").touch()
+    with pytest.raises(OSError, match=r"run cannot be written to \(.*name another folder for a new run with --out"):
+        new_folder(tmp_path / "runs" / "run")

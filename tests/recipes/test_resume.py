@@ -19,7 +19,7 @@ from interrupted_runs import cut, resume, run
 from coim import HopperMorph, load_run
 from coim.products import Choice
 from recipes import model_error, soak
-from recipes.checkpoint import Checkpoints
+from recipes.checkpoint import Checkpoints, SharedRandom
 from recipes.experiment import main
 from recipes.interrupt import Stopped, end_soon, locked, stopping_at_once
 from recipes.replay_file import ReplayFile
@@ -111,6 +111,48 @@ def test_other_packages_are_told(tmp_path: Path, capsys: pytest.CaptureFixture) 
     (folder / "config.json").write_text(json.dumps(config))
     resume(folder)
     assert "mujoco was 2.0 and is" in capsys.readouterr().err
+
+
+def test_a_run_goes_on_where_there_is_no_gpu_and_no_compiler(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    folder = cut(tmp_path / "cut", 6)
+    config = json.loads((folder / "config.json").read_text())
+    config["settings"] |= {"device": "cuda", "compile": True}
+    (folder / "config.json").write_text(json.dumps(config))
+    if not torch.cuda.is_available():
+        with pytest.raises(SystemExit, match=r"device 'cuda' cannot be used here .*; try --device cpu"):
+            resume(folder)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(SystemExit, match=r"no C\+\+ compiler .* or --no-compile"):
+        resume(folder, "--device", "cpu")
+    capsys.readouterr()
+    resume(folder, "--device", "cpu", "--no-compile")
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if "products" not in line] == [
+        "warning: device was cuda and is cpu; the numbers may differ from here",
+        "warning: compile was True and is False; the numbers may differ from here",
+    ]
+    assert soak.differences(whole, folder) == []  # it was cpu and not compiled in truth
+    config = json.loads((folder / "config.json").read_text())
+    assert config["settings"]["device"] == "cpu"
+    assert config["resumed"][-1]["changed"] == {"device": ["cuda", "cpu"], "compile": [True, False]}
+
+
+def test_generators_of_a_gpu_that_is_not_here_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = SharedRandom()
+    state = shared.state_dict()
+    expected = torch.rand(3)
+    shared.load_state_dict(state | {"torch_xpu": [torch.zeros(16, dtype=torch.uint8)]})
+    assert torch.equal(torch.rand(3), expected)
+    # Of two GPUs one is left.
+    restored: list[list[str]] = []
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_rng_state_all", lambda: [torch.zeros(1)])
+    monkeypatch.setattr("torch.cuda.set_rng_state_all", restored.append)
+    shared.load_state_dict(state | {"torch_cuda": [torch.ones(1), torch.zeros(1)]})
+    assert restored == [[torch.ones(1)]]
 
 
 def test_a_second_process_is_refused(tmp_path: Path) -> None:
