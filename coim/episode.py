@@ -1,12 +1,16 @@
 """One episode of a body under a policy, as rows of the transition schema.
 
 The loop writes bare tensors into rows that are there already; rewards and one TensorDict are made of all of them at the
-end. TensorDict, specs and distribution objects cost about ten times the physics per step.
+end. TensorDict, specs and distribution objects cost about ten times the physics per step. All is done on the CPU, where
+bodies are simulated: a policy that lives elsewhere acts by a copy, and the rows move once, when the episode is over.
 
 Shapes: T steps, K runs, S observation, D design, A action.
 """
 
 from __future__ import annotations
+
+from copy import deepcopy
+from itertools import chain
 
 import torch
 from tensordict import TensorDict
@@ -30,7 +34,7 @@ def run_episode(
     A row whose simulation breaks is stored as ``terminated`` and starts again with the same body; the other rows go on.
 
     Args:
-        env: K bodies in lock-step.
+        env: K bodies in lock-step, without transforms: rows hold what the bodies do, not what a transform makes of it.
         policy: who acts; None draws every action uniformly.
         design: ``[K, D]`` bodies to build before the episode; None keeps the present ones.
         deterministic: act with the mode of the policy instead of a sample.
@@ -38,9 +42,10 @@ def run_episode(
             episode is the same on each device, to rounding.
 
     Returns:
-        Rows ``[T, K]`` in the transition schema.
+        Rows ``[T, K]`` in the transition schema, on the environment's device.
 
     Raises:
+        TypeError: if ``env`` is no `MorphEnv`, such as a TransformedEnv.
         ValueError: if the design leaves its bounds (see `MorphEnv.reset`).
 
     Example:
@@ -49,16 +54,21 @@ def run_episode(
         >>> rows.batch_size, rows["observation"].shape
         (torch.Size([5, 2]), torch.Size([5, 2, 11]))
     """
-    start = TensorDict({} if design is None else {"design": design}, env.batch_size, device=env.device)
-    state = env.reset(start)
+    if not isinstance(env, MorphEnv):
+        raise TypeError(
+            f"an episode steps the bodies themselves, not {type(env).__name__}: pass a MorphEnv, which of a "
+            "TransformedEnv is its base_env, or take TorchRL's rollout, which applies the transforms"
+        )
+    start = None if design is None else TensorDict({"design": design}, env.batch_size, device=env.device)
+    state = env.reset(start).to("cpu")
     observation, design = state["observation"], state["design"]
     steps, shape = env.episode_steps, env.action_spec.shape
-    noise = _noise(steps, shape, policy, deterministic, rng, observation.device)
+    noise = _noise(steps, shape, policy, deterministic, rng)
     observations = observation.new_empty(steps, *observation.shape)
     following = torch.empty_like(observations)
     actions = observation.new_empty(steps, *shape)
-    broken = torch.zeros(steps, *env.batch_size, 1, dtype=torch.bool, device=observation.device)
-    network = None if policy is None else policy.network.for_design(design)
+    broken = torch.zeros(steps, *env.batch_size, 1, dtype=torch.bool, device="cpu")
+    network = None if policy is None else _on_cpu(policy).network.for_design(design)
     rows = zip(observations.unbind(), actions.unbind(), following.unbind(), broken.unbind())
     for t, (observed, acted, followed, ended) in enumerate(rows):
         observed.copy_(observation)
@@ -71,12 +81,13 @@ def run_episode(
         followed.copy_(observation)
         if terminated.any():
             ended.copy_(terminated)
-            observation = env.reset(TensorDict({"_reset": terminated}, env.batch_size))["observation"]
+            again = TensorDict({"_reset": terminated}, env.batch_size, device=env.device)
+            observation = env.reset(again)["observation"].cpu()
     designs = design.expand(steps, *design.shape)
     rewards = env.reward(observations, actions, following, designs, env.task)
     truncated = torch.zeros_like(broken)
     truncated[-1] = True
-    return TensorDict(
+    episode = TensorDict(
         {
             "observation": observations,
             "design": designs,
@@ -95,20 +106,21 @@ def run_episode(
         },
         [steps, *env.batch_size],
     )
+    return episode if env.device is None else episode.to(env.device)
+
+
+def _on_cpu(policy: Policy) -> Policy:
+    """The policy, or a copy of one that lives elsewhere, whose every action would have to be waited for."""
+    tensors = chain(policy.parameters(), policy.buffers())
+    return policy if all(tensor.device.type == "cpu" for tensor in tensors) else deepcopy(policy).cpu()
 
 
 def _noise(
-    steps: int,
-    shape: torch.Size,
-    policy: Policy | None,
-    deterministic: bool,
-    rng: torch.Generator | None,
-    device: torch.device,
+    steps: int, shape: torch.Size, policy: Policy | None, deterministic: bool, rng: torch.Generator | None
 ) -> Tensor:
     """What randomness the whole episode needs: uniform actions, standard normal noise, or none, ``[T, K, A]``."""
     if policy is not None and deterministic:
-        return torch.empty(0, device=device)
-    drawn_on = "cpu" if rng is None else rng.device
-    if policy is None:
-        return (torch.rand(steps, *shape, generator=rng, device=drawn_on) * 2 - 1).to(device)
-    return torch.randn(steps, *shape, generator=rng, device=drawn_on).to(device)
+        return torch.empty(0, device="cpu")
+    draw = torch.rand if policy is None else torch.randn
+    noise = draw(steps, *shape, generator=rng, dtype=torch.float32, device="cpu" if rng is None else rng.device).cpu()
+    return noise * 2 - 1 if policy is None else noise

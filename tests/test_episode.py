@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import ObservationNorm, TransformedEnv
 
 from coim import HopperMorph, make_policy, run_episode
 from coim.buffers import ROW_KEYS
+from coim.models import Policy
 
 
 def test_a_deterministic_episode_equals_a_rollout_with_the_same_policy() -> None:
@@ -84,3 +88,67 @@ def test_the_rewards_of_an_episode_are_those_of_its_steps_to_the_last_bit(task: 
     env.reset()
     rewards = torch.stack([env.advance(action)[1] for action in rows["action"]])
     assert torch.equal(rows["next", "reward"], rewards)
+
+
+def test_a_transformed_environment_is_refused_by_name() -> None:
+    normed = ObservationNorm(loc=1.0, scale=1.0, in_keys=["observation"])
+    env = TransformedEnv(HopperMorph(seed=0, episode_steps=3), normed)
+    with pytest.raises(
+        TypeError, match=r"not TransformedEnv: pass a MorphEnv.*its base_env, or take TorchRL's rollout"
+    ):
+        run_episode(env, None)
+    assert len(run_episode(env.base_env, None)) == 3
+
+
+def test_a_policy_that_lives_elsewhere_acts_by_a_copy_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The meta device stands in for a GPU: the original there cannot act at all."""
+    env, again = (HopperMorph(num_runs=2, seed=0, episode_steps=5) for _ in range(2))
+    here = make_policy(env, num_cells=(8,))
+    elsewhere = deepcopy(here).to("meta")
+    monkeypatch.setattr(Policy, "cpu", lambda copied: here if copied is not elsewhere else pytest.fail("it was moved"))
+    rows, expected = (
+        run_episode(bodies, policy, rng=torch.Generator().manual_seed(0))
+        for bodies, policy in ((env, elsewhere), (again, here))
+    )
+    assert (rows == expected).all()
+    assert all(parameter.is_meta for parameter in elsewhere.parameters())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_a_gpu_an_episode_steps_on_the_host_and_its_rows_are_the_cpus() -> None:
+    class Watched(HopperMorph):
+        """Lets nothing wait for the GPU from the first step to the last."""
+
+        moves = 0
+
+        def move(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            assert not action.is_cuda
+            self.moves += 1
+            torch.cuda.set_sync_debug_mode("error" if self.moves < 20 else "default")
+            return super().move(action)
+
+    env = Watched(num_runs=2, seed=0, episode_steps=20, device="cuda")
+    reference = HopperMorph(num_runs=2, seed=0, episode_steps=20)
+    policy = make_policy(reference, num_cells=(16,))
+    expected = run_episode(reference, policy, rng=torch.Generator().manual_seed(0))
+    try:
+        rows = run_episode(env, deepcopy(policy).cuda(), rng=torch.Generator().manual_seed(0))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert rows.device.type == "cuda"
+    for key in ROW_KEYS:
+        assert torch.equal(rows[key].cpu(), expected[key])
+
+
+def test_an_episode_is_the_same_under_another_default_dtype() -> None:
+    def rows() -> TensorDict:
+        env = HopperMorph(num_runs=2, seed=0, episode_steps=5)
+        return run_episode(env, None, rng=torch.Generator().manual_seed(0))
+
+    expected = rows()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert (rows() == expected).all()
+    finally:
+        torch.set_default_dtype(torch.float32)
