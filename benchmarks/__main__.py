@@ -23,6 +23,7 @@ from benchmarks.model import ensemble, imagination
 from benchmarks.rivals import sb3, sbx
 from benchmarks.search import search
 from benchmarks.updates import torchrl, update
+from recipes.interrupt import on_command_line
 from recipes.machine import available_cores, prepare
 
 Row = Literal[
@@ -89,4 +90,5 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, prog="python -m benchmarks", description=__doc__))
+    with on_command_line(own_process=True):
+        main(tyro.cli(Options, prog="python -m benchmarks", description=__doc__))

@@ -14,6 +14,7 @@ import tyro
 from benchmarks.networks import FOLDER, TRAINED, save
 from coim import EpisodeDone
 from coim.envs import BODIES
+from recipes.interrupt import on_command_line
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.parts import build
 from recipes.settings import Settings
@@ -58,4 +59,5 @@ def main(training: Training) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Training, description=__doc__))
+    with on_command_line(own_process=True):
+        main(tyro.cli(Training, description=__doc__))

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import tyro
 
+from recipes.interrupt import on_command_line
 from recipes.plots.runs import runs_of_folder
 from recipes.settings import read_config
 from recipes.studies.ledger import in_csv, read_ledger
@@ -39,10 +39,8 @@ class Archive:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     asked = tyro.cli(Archive, prog="python -m recipes.archive", description=__doc__, args=arguments)
-    try:
+    with on_command_line(own_process=arguments is None):
         kept = archive(asked.study, asked.target)
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
     print(f"{len(kept)} runs kept in {asked.target}; to draw them: python -m recipes.figures {asked.target}")
 
 

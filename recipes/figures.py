@@ -12,7 +12,6 @@ import csv
 import dataclasses
 import math
 import re
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from pathlib import Path
 import matplotlib as mpl
 import tyro
 
+from recipes.interrupt import on_command_line
 from recipes.plots import cartpole, design_space, model_error, retrained, returns, statistics
 from recipes.plots.intervals import FEW
 from recipes.plots.measured import FOLDER
@@ -45,12 +45,10 @@ class Figures:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     asked = tyro.cli(Figures, prog="python -m recipes.figures", description=__doc__, args=arguments)
-    try:
+    with on_command_line(own_process=arguments is None):
         for plot in write_figures(asked.study):
             place = asked.study / "figures" / plot.name
             print(f"{place}: {'nothing to draw. ' + plot.caption if plot.figure is None else 'written'}")
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 def write_figures(study: Path) -> list[Plot]:

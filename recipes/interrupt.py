@@ -40,7 +40,11 @@ def stopping_at_once() -> Iterator[None]:
     """Raise `Stopped` at the first Ctrl-C or SIGTERM, wherever the program is; a second one ends the process.
 
     Nothing is saved on the way out: there is a checkpoint of every episode, and the rest of this one can take long.
+    In a thread beside the main one, which no signal reaches, nothing changes.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     told: list[int] = []
 
     def stop(signum: int, frame: FrameType | None) -> None:
@@ -67,22 +71,31 @@ def stopping_at_once() -> Iterator[None]:
 
 
 @contextmanager
-def on_command_line(*, own_process: bool) -> Iterator[None]:
-    """Say in one line what was wrong with the input, and be gone soon after being told to end.
+def on_command_line(*, own_process: bool, also: tuple[type[Exception], ...] = (), again: str = "") -> Iterator[None]:
+    """Say in one line what was wrong with the input, or that this was told to end, and be gone soon.
 
     Args:
         own_process: whether the process ends with what is done here.
+        also: errors that are told in one line, beside those of a value or of the system.
+        again: what somebody does who has told it to end and wants to go on.
+
+    Raises:
+        SystemExit: 128 + 2 after Ctrl-C, 128 + 15 after SIGTERM, or the line of an error.
     """
     try:
-        yield
-    except (ValueError, OSError) as error:
+        with stopping_at_once():
+            yield
+    except Stopped as stop:
+        print(f"\n{stop}{again and '; '}{again}", file=sys.stderr)
+        if own_process:
+            end_soon(stop.signum)
+        sys.exit(128 + stop.signum)
+    except (ValueError, OSError, *also) as error:
         sys.exit(f"{type(error).__name__}: {error}")
     except SystemExit as leaving:
         if own_process and isinstance(leaving.__context__, Stopped):
             end_soon(leaving.__context__.signum)
         raise
-    except KeyboardInterrupt:  # before there was a run to go on with, or when it was over
-        sys.exit(130)
 
 
 def end_soon(signum: int) -> None:

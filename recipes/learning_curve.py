@@ -19,6 +19,7 @@ import torch
 import tyro
 
 from coim import EpisodeDone, HalfCheetahMorph, run_episode
+from recipes.interrupt import on_command_line
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.parts import build
 from recipes.reporting.pictures import save
@@ -135,4 +136,5 @@ def write(path: Path, rows: list[list]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Curve, description=__doc__))
+    with on_command_line(own_process=True, again="the same command goes on with the next seed"):
+        main(tyro.cli(Curve, prog="python -m recipes.learning_curve", description=__doc__))

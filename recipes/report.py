@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import tyro
 
 from coim import MorphEnv
 from coim.envs import BODIES
+from recipes.interrupt import on_command_line
 from recipes.reporting import diagnostics, figures
 from recipes.reporting.figures import Picture
 from recipes.reporting.page import FONT, image, note, page, section, table
@@ -38,10 +38,8 @@ class Report:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     asked = tyro.cli(Report, prog="python -m recipes.report", args=arguments)
-    try:
+    with on_command_line(own_process=arguments is None):
         print(write_report(asked.folders, out=asked.out))
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type[MorphEnv] | None = None) -> Path:

@@ -18,7 +18,6 @@ import csv
 import io
 import itertools
 import math
-import signal
 import sys
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +28,7 @@ from pathlib import Path
 import tyro
 
 from recipes.commands import plain_sac
-from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.interrupt import locked, on_command_line, stopping_at_once
 from recipes.machine import available_cores
 from recipes.plots.runs import Place, Run, Runs, read_runs
 from recipes.reporting.records import Row
@@ -85,14 +84,8 @@ class Retraining(Cell):
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line; ends with 1 if a design could not be trained."""
     asked = tyro.cli(Retrain, prog="python -m recipes.retrain", description=__doc__, args=arguments)
-    try:
+    with on_command_line(own_process=arguments is None, again="the same command goes on"):
         failed = retrain(asked)
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
-    except KeyboardInterrupt as stop:
-        signum = stop.signum if isinstance(stop, Stopped) else signal.SIGINT
-        print(f"\n{Stopped(signum)}; the same command goes on", file=sys.stderr)
-        sys.exit(128 + signum)
     if failed:
         sys.exit(f"failed: {', '.join(failed)}; see {asked.study}/retrained/ledger.csv")
 

@@ -25,6 +25,7 @@ import tyro
 from coim import HopperMorph
 from recipes.experiment import main as main_of_recipe
 from recipes.experiment import run
+from recipes.interrupt import on_command_line
 from recipes.results import Table
 from recipes.settings import Settings
 
@@ -193,4 +194,5 @@ def same_bits(one: torch.Tensor, other: torch.Tensor) -> bool:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Soak))
+    with on_command_line(own_process=True):
+        main(tyro.cli(Soak, prog="python -m recipes.soak", description=__doc__))

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import tyro
 
-from recipes.interrupt import Stopped, locked, stopping_at_once
+from recipes.interrupt import locked, on_command_line, stopping_at_once
 from recipes.machine import available_cores, checked_device
 from recipes.studies.cluster import ray_running, without_words_of_ray
 from recipes.studies.conduct import RETRIES, Conductor, Resources, refuse_lack, take_up
@@ -53,25 +53,21 @@ def main(options: Options) -> None:
     folder = options.out or Path("runs") / f"study-{study.name}"
     resources = Resources(options.cpus, options.gpus)
     workers = options.workers or max(1, available_cores() // options.cpus)
-    try:
-        with locked(folder), stopping_at_once():
-            cells = study.cells()
-            ledger = taken_up(folder, cells, resources)
-            write_whole(folder / "study.json", to_json(study))
-            waiting = len(ledger.in_state("waiting"))
-            print(f"{study.name}: {waiting} of {len(cells)} cells to compute -> {folder}")
-            if not waiting:
-                return
-            with (
-                without_words_of_ray(folder) as terminal,
-                ray_running(terminal, address=options.ray_address, workers=workers, cpus=options.cpus),
-                stopping_at_once(),  # once more: Ray takes SIGTERM for itself when it starts
-            ):
-                refuse_lack(resources, terminal, waits=options.ray_address is not None)
-                failed = Conductor(folder, cells, ledger, resources, terminal).conduct()
-    except Stopped as stop:
-        print(f"\n{stop}; to go on: {command(options)}", file=sys.stderr)
-        sys.exit(128 + stop.signum)
+    with locked(folder):
+        cells = study.cells()
+        ledger = taken_up(folder, cells, resources)
+        write_whole(folder / "study.json", to_json(study))
+        waiting = len(ledger.in_state("waiting"))
+        print(f"{study.name}: {waiting} of {len(cells)} cells to compute -> {folder}")
+        if not waiting:
+            return
+        with (
+            without_words_of_ray(folder) as terminal,
+            ray_running(terminal, address=options.ray_address, workers=workers, cpus=options.cpus),
+            stopping_at_once(),  # once more: Ray takes SIGTERM for itself when it starts
+        ):
+            refuse_lack(resources, terminal, waits=options.ray_address is not None)
+            failed = Conductor(folder, cells, ledger, resources, terminal).conduct()
     if failed:
         told = [f"  {name}: {ledger.entries[name].message[:300]}" for name in failed]
         again = f"to try them again: {command(options)}"
@@ -139,10 +135,8 @@ def command(options: Options) -> str:
 def entry(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     options = tyro.cli(Options, prog="python -m recipes.study", description=__doc__, args=arguments)
-    try:
+    with on_command_line(own_process=arguments is None, again=f"to go on: {command(options)}"):
         main(options)
-    except (ValueError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import tyro
 
+from recipes.interrupt import on_command_line
+
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
@@ -40,13 +42,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = tyro.cli(Watch, prog="python -m recipes.watch", args=arguments)
     if sys.platform == "linux" and not any(os.environ.get(name) for name in SCREENS):
         os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco asks for it once, when it is imported: so not above
-    try:
+    with on_command_line(own_process=arguments is None, also=(ImportError, RuntimeError)):
         from recipes.filming import film
 
         for path in film(**vars(asked)):
             print(path, flush=True)
-    except (ImportError, ValueError, RuntimeError, OSError) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 if __name__ == "__main__":

@@ -89,7 +89,8 @@ def test_a_label_is_dark_on_light_and_leaves_the_rest_alone() -> None:
 
 def watch(folder: Path, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command, in a process that has no screen."""
-    clean = {name: value for name, value in os.environ.items() if "DISPLAY" not in name and name != "MUJOCO_GL"}
+    chosen = {"MUJOCO_GL", "PYOPENGL_PLATFORM"}  # the second by mujoco, for whoever has set the first
+    clean = {name: value for name, value in os.environ.items() if "DISPLAY" not in name and name not in chosen}
     return subprocess.run(
         [sys.executable, "-W", "error::UserWarning", "-m", "recipes.watch", str(folder), *options],
         env=clean | environment, capture_output=True, text=True, timeout=120, check=False,
