@@ -1,10 +1,11 @@
 """A fleet of bodies on tensors: what is built, placed, moved and looked at, without TorchRL.
 
-Shapes: K runs (rows of the fleet), S observation, D design, A action. Everything is on the CPU in here.
+Shapes: K runs (rows of the fleet), S observation, D design, A action. Everything that is simulated is on the CPU.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import abstractmethod
 from pathlib import Path
@@ -17,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from coim.envs.camera import Camera
+from coim.envs.kinematics import Kinematics
 from coim.envs.planar import check_planar
 from coim.envs.simulation import PITCH, ROOT_X, Simulations
 from coim.randomness import restore_generator
@@ -70,6 +72,61 @@ class Fleet:
             spec: the body as drawn, xi = 1.
             design: scale factors within the bounds, ``[D]`` float64.
         """
+
+    def clearance(self, observation: Tensor, design: Tensor) -> Tensor:
+        """Height in m of the lowest point of a body above the floor, negative in it; differentiable in both.
+
+        Args:
+            observation: ``[*B, S]``.
+            design: ``[*B, D]``.
+
+        Returns:
+            ``[*B, 1]``; MuJoCo's own geometry to the precision of the observation.
+
+        Example:
+            >>> from coim import HopperMorph
+            >>> env = HopperMorph(reset_noise=0.0)
+            >>> standing = env.reset()
+            >>> env.clearance(standing["observation"], standing["design"])  # the soles start 4 cm above the floor
+            tensor([[0.0400]])
+        """
+        positions = observation[..., : self._kinematics.num_positions - self._first_position]
+        unseen = positions.new_zeros(*positions.shape[:-1], self._first_position)
+        return self._kinematics.lowest(torch.cat([unseen, positions], -1), design)
+
+    def transfer(self, observation: Tensor, design: Tensor, new_design: Tensor) -> Tensor:
+        """Give the state of one body to another: same joints, velocities and clearance; the root moves up or down.
+
+        A state holds the height of the root, which belongs to the legs that it was seen with: kept under other legs it
+        is a foot in the floor or a body in the air, a state that the other body cannot be in.
+
+        Args:
+            observation: ``[*B, S]``.
+            design: ``[*B, D]``, the body that the state was seen with.
+            new_design: ``[*B, D]``.
+
+        Returns:
+            ``[*B, S]``; the transfer back gives the observation again. Differentiable in all three.
+
+        Example:
+            >>> from coim import HopperMorph
+            >>> env = HopperMorph(reset_noise=0.0)
+            >>> standing = env.reset()
+            >>> legs = standing["design"] * torch.tensor([1.0, 2.0, 1.0, 1.0])  # a thigh of 0.9 m instead of 0.45 m
+            >>> env.transfer(standing["observation"], standing["design"], legs)[0, 0] - standing["observation"][0, 0]
+            tensor(0.4500)
+        """
+        rise = self.clearance(observation, design) - self.clearance(observation, new_design)
+        height = self._kinematics.height - self._first_position
+        before, after = observation[..., :height], observation[..., height + 1 :]
+        return torch.cat([before, observation[..., height, None] + rise, after], -1)
+
+    @functools.cached_property
+    def _kinematics(self) -> Kinematics:
+        bodies = self.simulations
+        return Kinematics(
+            lambda design: bodies.body(design).compile(), bounds=self.DESIGN_BOUNDS, size=self.DESIGN_SIZE
+        )
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Reset noise of one row for ``reset_noise=1``: uniform in [-1, 1], positions and velocities, float64."""

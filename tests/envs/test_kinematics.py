@@ -1,0 +1,117 @@
+"""Clearance and transfer: heights of bodies as torch functions, held against MuJoCo's own geometry."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from coim.envs import BODIES, HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
+from coim.envs.kinematics import Kinematics
+
+ROWS = 100
+
+
+def any_poses(env: MorphEnv, rows: int = ROWS) -> tuple[Tensor, Tensor]:
+    """Observations of any pose, also upside down, and designs, ``[rows, ...]`` float64."""
+    generator = torch.Generator().manual_seed(0)
+    size = env.observation_spec["observation"].shape[-1]
+    low, high = env.DESIGN_BOUNDS
+    observation = 7 * torch.rand(rows, size, generator=generator, dtype=torch.float64) - 3.5
+    return observation, low + (high - low) * torch.rand(rows, env.DESIGN_SIZE, generator=generator, dtype=torch.float64)
+
+
+def lowest_point(env: MorphEnv, observation: Tensor, design: Tensor) -> float:
+    """The lowest point of the body's capsules by MuJoCo's kinematics, in m."""
+    model = env.simulations.body(design.numpy()).compile()
+    data = mujoco.MjData(model)
+    seen = observation.numpy()[: model.nq - env._first_position]
+    data.qpos[env._first_position :] = seen
+    mujoco.mj_kinematics(model, data)
+    of_robot = model.geom_bodyid > 0
+    radius, half = model.geom_size[of_robot, 0], model.geom_size[of_robot, 1]
+    return float((data.geom_xpos[of_robot, 2] - radius - half * np.abs(data.geom_xmat[of_robot, 8])).min())
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_clearance_is_the_lowest_point_of_mujocos_geometry_in_any_pose(name: str) -> None:
+    env = BODIES[name]()
+    observation, design = any_poses(env)
+    truth = [lowest_point(env, row, body) for row, body in zip(observation, design)]
+    assert env.clearance(observation, design).squeeze(-1).numpy() == pytest.approx(truth, abs=1e-12)
+    single = env.clearance(observation.float(), design.float()).squeeze(-1)
+    assert single.numpy() == pytest.approx(truth, abs=3e-6)
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_transferred_state_keeps_its_joints_velocities_and_clearance_and_comes_back(name: str) -> None:
+    env = BODIES[name]()
+    observation, design = any_poses(env)
+    other = design.flip(0)
+    moved = env.transfer(observation, design, other)
+    changed = (moved != observation).any(0)
+    assert changed.nonzero().flatten().tolist() == [1 - env._first_position]  # the height of the root
+    torch.testing.assert_close(env.clearance(moved, other), env.clearance(observation, design))
+    torch.testing.assert_close(env.transfer(moved, other, design), observation)
+
+
+def test_a_standing_hopper_rises_by_what_its_legs_grow() -> None:
+    env = HopperMorph(reset_noise=0.0)
+    standing = env.reset()
+    longer = torch.tensor([[1.0, 2.0, 1.0, 1.0]])  # a thigh of 0.9 m instead of 0.45 m
+    moved = env.transfer(standing["observation"], standing["design"], longer)
+    there = env.reset(TensorDict({"design": longer}, [1]))["observation"]
+    torch.testing.assert_close(moved, there)
+    assert moved[0, 0].item() == pytest.approx(1.25 + 0.45)
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_every_body_starts_with_the_clearance_of_the_drawn_one(name: str) -> None:
+    env = BODIES[name](num_runs=8, reset_noise=0.0)
+    bodies = env.design_spec.expand(8, env.DESIGN_SIZE).rand()
+    start = env.reset(TensorDict({"design": bodies}, [8]))
+    clearance = env.clearance(start["observation"], bodies)
+    torch.testing.assert_close(clearance, clearance[:1].expand(8, 1), atol=1e-6, rtol=0)
+
+
+def test_both_have_gradients_in_state_and_design() -> None:
+    env = WalkerMorph()
+    observation, design = (part[:4].requires_grad_() for part in any_poses(env))
+    assert torch.autograd.gradcheck(env.clearance, (observation, design))
+    other = design.detach().flip(0).requires_grad_()
+    assert torch.autograd.gradcheck(env.transfer, (observation, design, other))
+
+
+def test_batches_of_any_shape_and_one_design_for_many_states() -> None:
+    env = HopperMorph()
+    observation, design = any_poses(env, 12)
+    many = env.clearance(observation.reshape(3, 4, -1), design[0])
+    assert many.shape == (3, 4, 1)
+    torch.testing.assert_close(many.reshape(12, 1), env.clearance(observation, design[:1].expand(12, -1)))
+
+
+def test_a_cheetah_of_other_lengths_has_its_own_clearance() -> None:
+    printed = HalfCheetahMorph(segment_lengths=(0.29, 0.3, 0.188, 0.29, 0.3, 0.188))
+    observation, design = any_poses(printed, 5)
+    truth = [lowest_point(printed, row, body) for row, body in zip(observation, design)]
+    assert printed.clearance(observation, design).squeeze(-1).numpy() == pytest.approx(truth, abs=1e-12)
+
+
+def test_lengths_that_are_not_affine_in_the_design_are_refused() -> None:
+    def squared(design: np.ndarray) -> mujoco.MjModel:
+        env = HopperMorph()
+        return env.simulations.body(design**2).compile()
+
+    with pytest.raises(ValueError, match="no affine function of its design"):
+        Kinematics(squared, bounds=(0.8, 1.4), size=4)
+
+
+def test_a_body_that_nothing_moves_up_is_refused() -> None:
+    arm = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body><joint axis='0 1 0'/><geom type='sphere' size='.1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(ValueError, match="neither a free joint nor a vertical slide"):
+        Kinematics(lambda design: arm.copy().compile(), bounds=(0.5, 2.0), size=1)
