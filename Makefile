@@ -8,7 +8,7 @@ BENCH_VENV := .venv-bench
 BENCH_STAMP := $(BENCH_VENV)/.installed
 RIVALS := stable-baselines3==2.9.2 sbx-rl==0.28.0 jax==0.10.2
 
-.PHONY: run test lint types bench clean
+.PHONY: run test test-lowest test-highest lint types bench clean
 
 run: $(STAMP)
 	$(BIN)/python -m recipes.half_cheetah --preset quick
@@ -16,6 +16,18 @@ run: $(STAMP)
 # One thread: threads that wait for each other in tiny products collapse when another process wants the same cores.
 test: lint types
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+# The tests on the lowest versions that setup.cfg allows, and on the newest there are, each in an environment of its own.
+# On another Python, torch, or on some tests: make test-lowest PYTHON=python3.13 TORCH=2.13.0 TESTS=tests/models
+test-lowest: FLOORS = sed -nE 's/^ +([a-z-]+) >= ([0-9.]+)$$/\1==\2/p' setup.cfg | grep -v $(if $(TORCH),'^torch==','^$$')
+test-highest: FLOORS = true
+test-lowest test-highest: test-%:
+	$(PYTHON) -m venv --clear .venv-$*
+	{ $(FLOORS); } > .venv-$*/constraints.txt
+	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt "torch$(if $(TORCH),==$(TORCH))"
+	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt -e '.[recipes,study,dev]'
+	.venv-$*/bin/python -m pip list --disable-pip-version-check
+	OMP_NUM_THREADS=1 .venv-$*/bin/python -m pytest $(TESTS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -42,4 +54,4 @@ $(BENCH_STAMP): setup.cfg pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(BENCH_VENV) *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH_VENV) .venv-lowest .venv-highest *.egg-info .mypy_cache .ruff_cache .pytest_cache
