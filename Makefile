@@ -8,7 +8,13 @@ BENCH_VENV := .venv-bench
 BENCH_STAMP := $(BENCH_VENV)/.installed
 RIVALS := stable-baselines3==2.9.2 sbx-rl==0.28.0 jax==0.10.2
 
-.PHONY: run test test-lowest test-highest lint types bench clean
+# What a GPU needs: an environment beside the torch that is there, installed from the folder WHEELS where there is no network.
+GPU_VENV := .venv-gpu
+GPU_STAMP := $(GPU_VENV)/.installed
+WHEELS ?=
+GPU_PIP = $(GPU_VENV)/bin/python -m pip install --quiet --disable-pip-version-check $(if $(WHEELS),--no-index --find-links $(WHEELS),)
+
+.PHONY: run test test-lowest test-highest lint types bench gpu clean
 
 run: $(STAMP)
 	$(BIN)/python -m recipes.half_cheetah --preset quick
@@ -39,6 +45,11 @@ types: $(STAMP)
 bench: $(BENCH_STAMP)
 	$(BENCH_VENV)/bin/python -m benchmarks
 
+gpu:
+	@$(PYTHON) benchmarks/missing.py
+	@$(MAKE) --no-print-directory $(GPU_STAMP)
+	$(GPU_VENV)/bin/python -m benchmarks.gpu
+
 # torch first and alone, so that the pinned build is there before anything asks for "any torch".
 $(STAMP): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"coim needs Python >= 3.11, $(PYTHON) is {sys.version.split()[0]}; try: make PYTHON=python3.11")'
@@ -53,5 +64,13 @@ $(BENCH_STAMP): setup.cfg pyproject.toml constraints.txt
 	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[recipes]' $(RIVALS)
 	@touch $@
 
+# torch, built for CUDA, is found where PYTHON has it, be that a system's folder or another environment's.
+$(GPU_STAMP): setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -m venv --system-site-packages $(GPU_VENV)
+	$(PYTHON) -c 'import pathlib, torch; print(pathlib.Path(torch.__file__).parents[1])' > "$$($(GPU_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/torch_there.pth"
+	$(GPU_PIP) 'setuptools >= 68'
+	$(GPU_PIP) --no-build-isolation -e . tyro pytest
+	@touch $@
+
 clean:
-	rm -rf $(VENV) $(BENCH_VENV) .venv-lowest .venv-highest *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH_VENV) $(GPU_VENV) .venv-lowest .venv-highest *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from statistics import median
 
+import torch
+
 from benchmarks.effort import Effort
 from benchmarks.floors import alone
 from benchmarks.measure import Figure, Target, interleaved, over
@@ -68,7 +70,17 @@ def iteration(effort: Effort) -> list[Figure]:
 class Iterations:
     """One run of Algorithm 1, an iteration at a time; the first call also builds the first body."""
 
-    def __init__(self, effort: Effort, *, designs: str, side_by_side: bool = False) -> None:
+    def __init__(
+        self,
+        effort: Effort,
+        *,
+        designs: str,
+        side_by_side: bool = False,
+        num_runs: int = 1,
+        device: torch.device | str = "cpu",
+        compile: bool = True,
+        threads: int | None = None,
+    ) -> None:
         settings = Settings(
             designs=designs,  # type: ignore[arg-type]
             num_designs=1,
@@ -80,9 +92,11 @@ class Iterations:
             batch_size=effort.batch_size,
             num_cells=effort.num_cells,
             model_cells=effort.model_cells,
-            compile=True,
+            num_runs=num_runs,
+            device=str(device),
+            compile=compile,
         )
-        threads = 2 if side_by_side else 1
+        threads = threads or (2 if side_by_side else 1)
         self._events = iter(build(HalfCheetahMorph, settings, threads=threads, side_by_side=side_by_side))
         self._done: list[EpisodeDone] = []
 

@@ -65,21 +65,26 @@ def random_rows(*batch: int, seed: int = 0) -> TensorDict:
     return TensorDict(row, batch)
 
 
-def replay(num_runs: int) -> TransitionBuffer:
+def replay(num_runs: int, *, device: torch.device | str = "cpu") -> TransitionBuffer:
     """A buffer full of random rows."""
-    buffer = TransitionBuffer(REPLAY_ROWS, num_runs=num_runs, seed=0)
+    buffer = TransitionBuffer(REPLAY_ROWS, num_runs=num_runs, seed=0, device=device)
     buffer.extend(random_rows(REPLAY_ROWS, num_runs))
     return buffer
 
 
 def sac_learner(
-    effort: Effort, *, num_runs: int = 1, precision: Precision = "float32", compile: bool = True
+    effort: Effort,
+    *,
+    num_runs: int = 1,
+    precision: Precision = "float32",
+    compile: bool = True,
+    device: torch.device | str = "cpu",
 ) -> SACLearner:
     """Fresh policy and critics."""
     env, stacked = HalfCheetahMorph(seed=0), num_runs if num_runs > 1 else None
     return SACLearner(
-        make_policy(env, num_cells=effort.num_cells, num_runs=stacked),
-        make_qvalue(env, num_cells=effort.num_cells, num_runs=stacked),
+        make_policy(env, num_cells=effort.num_cells, num_runs=stacked).to(device),
+        make_qvalue(env, num_cells=effort.num_cells, num_runs=stacked).to(device),
         num_runs=stacked,
         precision=precision,
         compile=compile,

@@ -75,9 +75,10 @@ def our_updates(
     num_runs: int = 1,
     precision: Precision = "float32",
     compile: bool = True,
+    device: torch.device | str = "cpu",
 ) -> Callable[[], None]:
     """So many updates as Algorithm 1 does them: all batches in one draw, then `SACLearner.update`."""
-    learner = sac_learner(effort, num_runs=num_runs, precision=precision, compile=compile)
+    learner = sac_learner(effort, num_runs=num_runs, precision=precision, compile=compile, device=device)
 
     def run() -> None:
         batches = sample_batches(buffer, batch_size=effort.batch_size, num_batches=updates)

@@ -141,9 +141,9 @@ def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:
     ]
     if sizes[0] != sizes[1]:
         raise ValueError(f"the dream has sizes {sizes[1]}, the bodies {sizes[0]}; make the dream of these bodies")
-    rng = torch.Generator().manual_seed(0)
+    rng = torch.Generator("cpu").manual_seed(0)
     observation, action, following, design = (
-        torch.randn(TRIES, sizes[0][key], generator=rng).to(env.device or "cpu")
+        torch.randn(TRIES, sizes[0][key], generator=rng, dtype=torch.float32, device="cpu").to(env.device or "cpu")
         for key in ("observation", "action", "observation", "design")
     )
     row = (observation, action.tanh(), following, design.sigmoid() + 0.5)

@@ -68,7 +68,7 @@ class CoAdaptation:
         population: learner that sees all designs.
         individual: learner that sees the current design; starts each design from the population's weights.
         buffers: Replay_Pop, Replay_Ind, Replay_s0 and Replay_Art. They may live on the CPU while the learners are on a
-            GPU: batches are moved, all of one call at once.
+            GPU, which then moves the batches of one call at once.
         search: maximises Eq. 5 over the design space.
         first_designs: ``[I, D]`` bodies that every run tries first, on the device of the bodies.
         bodies: which come after them: ``"search"`` is Algorithm 1 (the optimum of Eq. 5 and a random one in turn),
@@ -219,14 +219,14 @@ class CoAdaptation:
 
     def _generators(self, seed: int) -> dict[str, torch.Generator]:
         """One for each reader and writer, so that nothing depends on who comes first; each where its numbers are."""
-        seeds = torch.Generator().manual_seed(seed)
+        seeds = torch.Generator("cpu").manual_seed(seed)
         replay = self.buffers.pop.storage.device
         # The bodies move on the CPU: what they get is drawn there, and is the same wherever the networks are.
         cpu = torch.device("cpu")
         devices: dict[str, torch.device] = {"actions": cpu, "dream": self.device, "designs": cpu}
         devices |= dict.fromkeys(("individual", "population", "model"), replay)
         return {
-            name: torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=seeds)))
+            name: torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=seeds, device="cpu")))
             for name, device in devices.items()
         }
 
@@ -240,14 +240,13 @@ class CoAdaptation:
             # Collect experience for the current design with pi_Ind.
             with booked(seconds, "collect"):
                 rows = run_episode(self.env, self.individual.policy, design=design, rng=self.rngs["actions"])
-                stored = self._to_replay(rows)
-                self.buffers.ind.extend(stored)
-                self.buffers.pop.extend(stored)
+                self.buffers.ind.extend(rows)
+                self.buffers.pop.extend(rows)
             # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
             with booked(seconds, "imagine"):
                 metrics = self._observe(rows)
                 self._refresh_imagined()
-            self.buffers.s0.extend(stored[:1])
+            self.buffers.s0.extend(rows[:1])
             self.divergence.remember()
             metrics |= self._learn(seconds)
             self.divergence.contain(metrics, place)
@@ -275,9 +274,8 @@ class CoAdaptation:
         """Scale the ensemble by the new rows, and say how well it foresaw them before it learns from them."""
         if self.dynamics is None:
             return {}
-        seen = rows.to(self.device)
-        self.dynamics.observe(seen)
-        return {"model_error": self.dynamics.error(seen).cpu()}
+        self.dynamics.observe(rows)
+        return {"model_error": self.dynamics.error(rows).cpu()}
 
     def _refresh_imagined(self) -> None:
         """Empty Replay_Art and fill it with states of Replay_Pop, designs of G, and actions of pi_Pop."""
@@ -286,11 +284,7 @@ class CoAdaptation:
             return
         states = self.buffers.pop.sample(self.imagined_rows).to(self.device)
         rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self.rngs["dream"])
-        self.buffers.art.extend(self._to_replay(rows))
-
-    def _to_replay(self, rows: TensorDictBase) -> TensorDictBase:
-        """Rows where the buffers are."""
-        return rows.to(self.buffers.pop.storage.device)
+        self.buffers.art.extend(rows)
 
     def _rows_to_draw(self) -> int:
         """Imagined rows that the updates after one episode will draw, and at least one."""
@@ -337,7 +331,7 @@ class CoAdaptation:
                     raise RuntimeError("an update failed or was interrupted; go on from a state_dict of before")
                 count = min(UPDATES_PER_SAMPLE, updates - done)
                 batches = sample_mixture(sources, count, imagined=self.buffers.art, rng=self.rngs[name])
-                for key, value in learner.update(batches.to(self.device)).items():
+                for key, value in learner.update(batches).items():
                     means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + value.cpu() * (count / updates)
         return means
 

@@ -37,7 +37,8 @@ def next_trial(algorithm: CoAdaptation) -> Trial:
         design = design.clone()
         design[frozen] = algorithm.buffers.ind[0]["design"][frozen].to(design.device)
         predicted = None if predicted is None else algorithm.divergence.blank(predicted, (algorithm.index, 0))
-    return Trial(kind, design, predicted, best=torch.full(algorithm.env.batch_size, -torch.inf))
+    best = torch.full(algorithm.env.batch_size, -torch.inf, dtype=torch.float32, device="cpu")
+    return Trial(kind, design, predicted, best=best)
 
 
 def _next_design(algorithm: CoAdaptation) -> tuple[Kind, Tensor, Tensor | None]:
@@ -53,7 +54,8 @@ def _next_design(algorithm: CoAdaptation) -> tuple[Kind, Tensor, Tensor | None]:
         return "first", design, _predict(algorithm, design)
     if algorithm.bodies == "search" and since % 2 == 0:
         found = [algorithm.search.maximise(fitness) for fitness in _fitness(algorithm)]
-        return "optimised", torch.stack([d for d, _ in found]), torch.tensor([value for _, value in found])
+        values = torch.tensor([value for _, value in found], dtype=torch.float32, device="cpu")
+        return "optimised", torch.stack([design for design, _ in found]), values
     draw = RandomDesigns(algorithm.env.design_spec)
     design = draw(first[:1].cpu().expand(runs, -1), rng=algorithm.rngs["designs"]).to(first.device)
     return "random", design, _predict(algorithm, design)

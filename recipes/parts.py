@@ -65,7 +65,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         individual=individual,
         buffers=make_buffers(env, settings, seed=next(seeds)),
         search=make_search(env, settings, seed=next(seeds)),
-        first_designs=torch.tensor(first_designs(body, settings), device=device),
+        first_designs=torch.tensor(first_designs(body, settings), dtype=torch.float32, device=device),
         bodies=settings.bodies,
         dynamics=dynamics,
         dream=dream,

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_coadaptation import STEPS, small
+from test_coadaptation import STEPS
 from torch import Tensor
 
 from coim import (
@@ -188,21 +188,6 @@ def test_learners_go_side_by_side_on_the_cpu_alone() -> None:
     assert check_learners(ENV, elsewhere(), elsewhere(), None, side_by_side=False).type == "meta"
     with pytest.raises(ValueError, match="population is on meta, dynamics on cpu"):
         check_learners(ENV, elsewhere(), elsewhere(), DynamicsLearner(ensemble(), num_runs=2), side_by_side=False)
-
-
-def test_batches_are_moved_to_the_learners_once_per_draw(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = small(first_episodes=1, num_designs=1)
-    list(made)
-    made.device = torch.device("meta")  # stands for a GPU
-    seen: list[tuple[str, int]] = []
-
-    def update(batches: Any) -> dict[str, Tensor]:
-        seen.append((batches["action"].device.type, len(batches)))
-        return {}
-
-    monkeypatch.setattr(made.population, "update", update)
-    made._train("population", made.population, made.population_parts, 120, {})
-    assert seen == [("meta", 50), ("meta", 50), ("meta", 20)]
 
 
 def test_a_fleet_of_one_run_searches_for_its_body() -> None:

@@ -29,26 +29,37 @@ from coim.batches import BatchParts
 STEPS = 12
 
 
-def small(num_runs: int = 1, *, imagine: bool = True, sigma: float | None = None, **settings: Any) -> CoAdaptation:
-    """Algorithm 1 on hoppers with tiny networks, few steps and few updates."""
+def small(
+    num_runs: int = 1,
+    *,
+    imagine: bool = True,
+    sigma: float | None = None,
+    device: str = "cpu",
+    replay: str | None = None,
+    **settings: Any,
+) -> CoAdaptation:
+    """Algorithm 1 on hoppers with tiny networks, few steps and few updates; the replay is where the networks are."""
     torch.manual_seed(0)
     stacked = num_runs if num_runs > 1 else None
-    env, evaluation_env = (HopperMorph(num_runs=num_runs, episode_steps=STEPS, seed=seed) for seed in (0, 1))
+    env, evaluation_env = (
+        HopperMorph(num_runs=num_runs, episode_steps=STEPS, seed=seed, device=device) for seed in (0, 1)
+    )
 
     def learner(seed: int) -> SACLearner:
-        policy = make_policy(env, num_cells=(8,), num_runs=stacked)
-        return SACLearner(policy, make_qvalue(env, num_cells=(8,), num_runs=stacked), num_runs=stacked, seed=seed)
+        policy = make_policy(env, num_cells=(8,), num_runs=stacked).to(device)
+        qvalue = make_qvalue(env, num_cells=(8,), num_runs=stacked).to(device)
+        return SACLearner(policy, qvalue, num_runs=stacked, seed=seed)
 
     imagination: dict[str, Any] = {}
     if imagine:
-        ensemble = GaussianEnsemble.for_env(env, num_cells=(8,), num_runs=stacked)
+        ensemble = GaussianEnsemble.for_env(env, num_cells=(8,), num_runs=stacked).to(device)
         imagination = {
             "dynamics": DynamicsLearner(ensemble, num_runs=stacked),
             "dream": WorldModelEnv(ensemble, env, batch_size=env.batch_size),
             "generator": KnownDesigns() if sigma is None else NoisyDesigns(env.design_spec, sigma=sigma),
         }
     defaults: dict[str, Any] = {
-        "first_designs": torch.tensor(HopperMorph.FIRST_DESIGNS[:2]),
+        "first_designs": torch.tensor(HopperMorph.FIRST_DESIGNS[:2], device=device),
         "num_designs": 5,
         "first_episodes": 2,
         "episodes": 1,
@@ -64,7 +75,7 @@ def small(num_runs: int = 1, *, imagine: bool = True, sigma: float | None = None
         evaluation_env,
         population=learner(1),
         individual=learner(2),
-        buffers=Buffers.for_env(env, **capacities, seed=0),
+        buffers=Buffers.for_env(env, **capacities, seed=0, device=replay or device),
         search=ParticleSwarm(env.design_spec, num_particles=5, num_iterations=2, seed=0),
         **imagination | defaults | settings,
     )
@@ -172,6 +183,22 @@ def test_noisy_designs_are_imagined_but_never_stored_as_real() -> None:
 def test_the_same_seed_gives_the_same_events() -> None:
     first, second = ([event.evaluation_return for event in small() if isinstance(event, EpisodeDone)] for _ in range(2))
     assert torch.equal(torch.stack(first), torch.stack(second))
+
+
+def test_a_run_does_not_depend_on_the_defaults_of_torch() -> None:
+    expected, algorithm = list(small(num_designs=4)), small(num_designs=4)
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):  # a tensor that is made on the default device has no numbers
+            events = list(algorithm)
+    finally:
+        torch.set_default_dtype(usual)
+    for event, other in zip(events, expected, strict=True):
+        if isinstance(event, EpisodeDone):
+            assert torch.equal(event.evaluation_return, other.evaluation_return)
+            assert event.evaluation_return.dtype == torch.float32
+        assert torch.equal(event.design, other.design)
 
 
 @pytest.mark.parametrize(

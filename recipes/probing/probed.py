@@ -154,11 +154,10 @@ class ProbedCoAdaptation:
     def _learn(self) -> None:
         """Let the other model learn what the algorithm's own has just learnt."""
         algorithm, pop = self.algorithm, self.algorithm.buffers.pop
-        self.other.observe(pop[len(pop) - algorithm.env.episode_steps :].to(algorithm.device))
+        self.other.observe(pop[len(pop) - algorithm.env.episode_steps :])
         for done in range(0, algorithm.model_updates, UPDATES_PER_SAMPLE):
             count = min(UPDATES_PER_SAMPLE, algorithm.model_updates - done)
-            batches = sample_mixture([(pop, algorithm.batch_size)], count, rng=self._rng)
-            self.other.update(batches.to(algorithm.device))
+            self.other.update(sample_mixture([(pop, algorithm.batch_size)], count, rng=self._rng))
 
     def _measure(self, event: EpisodeDone) -> None:
         """All that is measured after an episode."""

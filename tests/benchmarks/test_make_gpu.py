@@ -1,0 +1,65 @@
+"""`make gpu` without a GPU: it says what is missing, and its whole way can be rehearsed on a CPU."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks import gpu
+from benchmarks.gpu import Options, main
+
+ROWS = {"update, K = 1", "update, K = 2", "iteration, K = 1", "iteration, K = 2"}
+
+
+def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu, "marked_tests", lambda seconds: {"holds": True, "tests": 0})
+    monkeypatch.setattr("coim.learner.compiled", lambda find, device: find)  # takes ten seconds
+    main(Options(rehearse=True, out=tmp_path / "runs" / "gpu.json"))
+    found = json.loads((tmp_path / "runs" / "gpu.json").read_text())
+    assert found["rehearsal"]
+    assert found["parts"].keys() == {"tests", "fleet"} | ROWS
+    assert found["parts"]["fleet"]["largest difference of an observation"] == 0  # of the CPU from the CPU
+    assert found["parts"]["fleet"]["designs"] == 3
+    assert all(figure["ratio"]["median"] > 0 for name in ROWS for figure in found["parts"][name]["figures"])
+
+
+def test_marked_tests_are_counted() -> None:
+    counted = gpu.marked_tests(120)
+    assert counted["holds"], counted
+    assert counted["tests"] >= 5
+    if not torch.cuda.is_available():
+        assert counted["skipped"] == counted["tests"]
+
+
+def test_a_part_that_fails_or_comes_too_late_is_told_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def broken(*_: object) -> gpu.Result:
+        raise RuntimeError("no kernel image")
+
+    for name in ("marked_tests", "fleet", "update", "iteration"):
+        monkeypatch.setattr(gpu, name, broken if name == "fleet" else lambda *_: {"holds": True})
+    out = tmp_path / "gpu.json"
+    with pytest.raises(SystemExit, match="not well: fleet; see"):
+        main(Options(rehearse=True, out=out))
+    assert json.loads(out.read_text())["parts"]["fleet"]["error"] == "RuntimeError: no kernel image"
+    with pytest.raises(SystemExit, match="not well: tests; fleet; update, K = 1"):
+        main(Options(rehearse=True, out=out, minutes=0))
+    assert "left out after 0 min" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="nothing is missing where there is a GPU")
+def test_one_line_says_what_is_missing(tmp_path: Path) -> None:
+    script = Path(gpu.__file__).with_name("missing.py")
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("make gpu needs a GPU of NVIDIA, and torch ")
+    assert ended.stderr.count("\n") == 1
+    with pytest.raises(SystemExit, match="make gpu needs a GPU"):
+        main(Options(out=tmp_path / "gpu.json"))
+    assert not (tmp_path / "gpu.json").exists()
