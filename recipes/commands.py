@@ -74,7 +74,7 @@ def last_words(folder: Path, name: str, body: type[MorphEnv], settings: Settings
     of_run = f" of run {best.run}" if fleet else ""
     lines = [
         f"best body: design {best.number}{of_run} ({best.kind}), return {number(best.best_return)}: "
-        + in_names(best.design.tolist(), body)
+        + ", ".join(in_names(best.design.tolist(), body))
     ]
     if BODIES.get(name) is body:  # another body has no recipe of this name
         film = [
@@ -92,12 +92,12 @@ def last_words(folder: Path, name: str, body: type[MorphEnv], settings: Settings
     return lines
 
 
-def in_names(design: Sequence[float], body: type[MorphEnv]) -> str:
-    """A design for a reader.
+def in_names(design: Sequence[float], body: type[MorphEnv]) -> list[str]:
+    """The entries of a design for a reader.
 
     Example:
         >>> from coim import HopperMorph
         >>> in_names([1.0, 0.5, 1.23456, 2.0], HopperMorph)
-        'torso 1, thigh 0.5, shank 1.235, foot 2'
+        ['torso 1', 'thigh 0.5', 'shank 1.235', 'foot 2']
     """
-    return ", ".join(f"{name} {number(xi)}" for name, xi in zip(body.design_names(), design))
+    return [f"{name} {number(xi)}" for name, xi in zip(body.design_names(), design)]

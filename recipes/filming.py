@@ -19,11 +19,13 @@ from tensordict import TensorDict
 
 from coim import SavedRun, TriedDesign, load_run
 from coim.envs.camera import Camera
+from recipes.commands import in_names
 from recipes.reporting.records import number
 
 FRAMES_PER_SECOND = 30  # at most; an environment that takes fewer steps in a second shows each of them
 TOP = 5
 TEXT_SHARE, LEAST_TEXT = 24, 12  # height of a picture over that of its letters; pixels
+MOST_TEXT = 0.4  # of the height of a picture may be covered
 GAP = 4  # pixels between two pictures
 
 
@@ -33,6 +35,7 @@ class Take:
 
     Attributes:
         tried: the design.
+        entries: of the design, by their names.
         camera: in front of its body.
         poses: joint positions before each step and after the last, ``[T + 1, nq]``.
         speed: along x in m/s, ``[T + 1]``.
@@ -41,6 +44,7 @@ class Take:
     """
 
     tried: TriedDesign
+    entries: Sequence[str]
     camera: Camera
     poses: np.ndarray
     speed: np.ndarray
@@ -56,7 +60,7 @@ class Take:
                     f"design {self.tried.number}, {self.tried.kind}: best return {number(self.tried.best_return)}",
                     f"{time:.1f} s   {speed:+.2f} m/s   return {number(self.returned[t])}",
                 )
-                yield labelled(self.camera.photograph(self.poses[t]), lines)
+                yield labelled(self.camera.photograph(self.poses[t]), lines, self.entries)
 
 
 def film(folder: Path, *, design: str, run: int | None, steps: int | None, width: int, height: int) -> Iterator[Path]:
@@ -139,6 +143,7 @@ def take(loaded: SavedRun, tried: TriedDesign, width: int, height: int) -> Take:
             bodies.reset(TensorDict({"_reset": broken}, bodies.batch_size))
     return Take(
         tried=tried,
+        entries=in_names(tried.design.tolist(), type(bodies)),
         camera=bodies.camera(row, width=width, height=height),
         poses=np.stack(poses),
         speed=np.array(speed),
@@ -174,13 +179,33 @@ def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.concatenate([*line, *[white] * (columns - len(line))], 1) for line in lines])
 
 
-def labelled(picture: np.ndarray, lines: Sequence[str]) -> np.ndarray:
-    """A picture with lines of text at its top, dark on a light band."""
+def labelled(picture: np.ndarray, lines: Sequence[str], entries: Sequence[str] = ()) -> np.ndarray:
+    """A picture with lines of text at its top, dark on a light band.
+
+    Args:
+        picture: ``[height, width, 3]`` uint8.
+        lines: of text.
+        entries: words that go below them, as many in a line as it can hold; none where all of them would take too much
+            of the picture.
+    """
     size = max(LEAST_TEXT, picture.shape[0] // TEXT_SHARE)
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    draw.rectangle((0, 0, image.width, (len(lines) * 13 + 6) * size // 10), fill=(255, 255, 255, 190))
     font = ImageFont.load_default(size)
+
+    def bottom(lines: Sequence[str]) -> int:
+        return (len(lines) * 13 + 6) * size // 10
+
+    below: list[str] = []
+    for entry in entries:
+        longer = f"{below[-1]}, {entry}" if below else entry
+        if below and font.getlength(longer) <= image.width - size:
+            below[-1] = longer
+        else:
+            below.append(entry)
+    if bottom([*lines, *below]) <= MOST_TEXT * image.height:
+        lines = [*lines, *below]
+    draw.rectangle((0, 0, image.width, bottom(lines)), fill=(255, 255, 255, 190))
     for i, line in enumerate(lines):
         draw.text((size // 2, (i * 13 + 3) * size // 10), line, fill=(0, 0, 0), font=font)
     return np.asarray(image)

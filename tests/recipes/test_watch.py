@@ -87,6 +87,18 @@ def test_a_label_is_dark_on_light_and_leaves_the_rest_alone() -> None:
     assert (shown[40:] == 90).all()
 
 
+def test_the_entries_of_a_design_stand_below_the_label_in_as_many_lines_as_they_need() -> None:
+    picture, line = np.full((240, 320, 3), 90, np.uint8), ("design 7, random: best return 123.4",)
+
+    def height(*entries: str) -> int:
+        return int((labelled(picture, line, entries) != 90).any((1, 2)).sum())
+
+    bare = height()
+    assert height("torso 1.26", "foot 0.5") == bare + 16  # a line is 1.3 times as high as its letters of 12 pixels
+    assert height(*["right thigh 1.33"] * 4) > height("torso 1.26", "foot 0.5")
+    assert height(*["right thigh 1.33"] * 60) == bare  # they would hide the body
+
+
 def watch(folder: Path, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command, in a process that has no screen."""
     chosen = {"MUJOCO_GL", "PYOPENGL_PLATFORM"}  # the second by mujoco, for whoever has set the first
