@@ -12,8 +12,9 @@ from typing import Any
 from coim import MorphEnv
 from coim.envs import BODIES
 from coim.saved_run import TriedDesign, read_designs
+from recipes.effect import without_effect
 from recipes.reporting.records import number
-from recipes.settings import PRESETS, Settings
+from recipes.settings import PRESETS, Settings, option
 from recipes.writing import shortest
 
 
@@ -33,22 +34,22 @@ def plain_sac(settings: Settings, design: Sequence[float], **changed: Any) -> Se
 
 
 def options(settings: Settings) -> list[str]:
-    """Words of a recipe's command line that give these settings.
+    """Words of a recipe's command line that give these settings, less those that change nothing, which it refuses.
 
     Example:
         >>> options(Settings(compile=True, seed=3, num_cells=(64, 64)))
         ['--seed', '3', '--num-cells', '64', '64']
     """
-    default = PRESETS[settings.preset]
+    default, idle = PRESETS[settings.preset], without_effect(settings)
     words = [] if settings.preset == Settings.preset else ["--preset", settings.preset]
     for field in dataclasses.fields(Settings):
-        value, name = getattr(settings, field.name), field.name.replace("_", "-")
-        if field.name == "preset" or value == getattr(default, field.name):
+        value = getattr(settings, field.name)
+        if field.name == "preset" or field.name in idle or value == getattr(default, field.name):
             continue
         if isinstance(value, bool):
-            words.append(f"--{name}" if value else f"--no-{name}")
+            words.append(option(field.name if value else f"no_{field.name}"))
         else:
-            words += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
+            words += [option(field.name), *map(str, value if isinstance(value, tuple) else (value,))]
     return words
 
 
@@ -84,7 +85,8 @@ def last_words(folder: Path, name: str, body: type[MorphEnv], settings: Settings
             str(best.number),
             *(["--run", str(best.run)] if fleet else []),
         ]
-        alone = plain_sac(settings, [float(shortest(xi)) for xi in best.design.tolist()])
+        design = [float(shortest(xi)) for xi in best.design.tolist()]
+        alone = plain_sac(settings, design, name=PRESETS[settings.preset].name)  # --out may be put behind it
         lines.append(f"to film it: python -m {shlex.join(film)}")
         if settings.num_designs > 1:
             anew = shlex.join([f"recipes.{name}", *options(alone)])
