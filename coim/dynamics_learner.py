@@ -27,6 +27,7 @@ from coim.objectives.dynamics import EnsembleNLLLoss, check_one_step
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Network
 from coim.objectives.runs import by_update, check_batch
+from coim.written_out import check_ensemble
 
 
 class DynamicsLearner:
@@ -48,6 +49,7 @@ class DynamicsLearner:
 
     Raises:
         ValueError: if ``precision`` is unknown or ``num_runs`` is not the ensemble's.
+        TypeError: if the ensemble computes anything else than a `coim.GaussianEnsemble`.
 
     Note:
         Moving the ensemble to another device or dtype afterwards parts it from the flat buffer; so does a deep copy of
@@ -75,6 +77,7 @@ class DynamicsLearner:
     ) -> None:
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
+        check_ensemble(ensemble)
         self.ensemble, self.num_runs = ensemble, num_runs
         self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
         self._lay_out(list(ensemble.network.parameters()), precision)

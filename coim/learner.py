@@ -25,14 +25,13 @@ from coim.continuation import check_sizes, load_moments
 from coim.flat import FlatUpdates, by_run, captures, moments_by_run, on_device, save_alone, share_storage, views
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
-from coim.models.scaling import InputScaling
 from coim.models.stacked import StackedMLP
-from coim.objectives.dynamics import check_one_step
 from coim.objectives.functional import mixing_weights
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
 from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
+from coim.written_out import check_sac_networks, check_sac_rows
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -62,6 +61,7 @@ class SACLearner:
     Raises:
         ValueError: if ``precision`` is unknown, a number is out of its range, ``num_runs`` is not the networks', or
             policy and critics scale their inputs differently.
+        TypeError: if a network computes anything else than those of `coim.models` do, such as another activation.
 
     Note:
         On CUDA an update is captured as a CUDA graph and replayed, until batches have another size.  Where the
@@ -99,8 +99,7 @@ class SACLearner:
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
         if not 0 < tau <= 1:
             raise ValueError(f"tau={tau} is outside (0, 1]; Sec. 6.1 has 0.005")
-        if not same_scaling(policy.network.scaling, qvalue.module.scaling):
-            raise ValueError("policy and qvalue scale their inputs differently; make both for the same environment")
+        check_sac_networks(policy, qvalue)
         self.policy, self.qvalue = policy, qvalue
         self.loss = CoImSACLoss(policy, qvalue, alpha=alpha, gamma=gamma, mix=mix, num_runs=num_runs)
         SoftUpdate(self.loss, tau=tau)  # starts the targets at the critics, and tells TorchRL that they are cared for
@@ -178,7 +177,7 @@ class SACLearner:
             RuntimeError: if the networks' weights no longer lie in the flat buffer.
         """
         batches = by_update(batches, self.num_runs)
-        self._check_keys(batches)
+        check_sac_rows(batches, self.loss.tensor_keys)
         lies_at = {parameter.data_ptr() for parameter in self._parameters()}
         if lies_at != {view.data_ptr() for view in views(self._weights, self._parameters())}:
             raise RuntimeError("the networks were moved after their learner was made; make the learner last")
@@ -211,16 +210,6 @@ class SACLearner:
 
     def _numbers(self) -> dict[str, Any]:
         return {"alpha": self.loss.alpha, "gamma": self.loss.gamma, "tau": self.tau}
-
-    def _check_keys(self, batches: TensorDictBase) -> None:
-        """Refuse what `CoImSACLoss` takes into account and the gradients here do not."""
-        keys = self.loss.tensor_keys
-        check_one_step(batches, keys.steps_to_next_obs)
-        if keys.priority_weight in batches.keys(True):
-            raise ValueError(
-                f"rows with {keys.priority_weight!r}: SACLearner has no importance weights; train with CoImSACLoss, or "
-                "exclude() the key to count all rows alike"
-            )
 
     # -- one flat buffer, and views of it ------------------------------------------------------------------------------
 
@@ -310,13 +299,6 @@ class SACLearner:
             torch._foreach_copy_(policy, gradients.policy)
             for own, gradient in zip(critics, gradients.critics):
                 torch._foreach_copy_(own, gradient)
-
-
-def same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
-    """Whether two networks see the same numbers."""
-    if one is None or other is None:
-        return one is other
-    return all(torch.equal(a, b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
 
 
 def _network(layers: Sequence[Tensor], index: Any) -> Network:

@@ -64,21 +64,26 @@ def recordings(monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
     return Recording.made
 
 
-def sac_learner(**kwargs: Any) -> SACLearner:
-    torch.manual_seed(0)
-    env = ToyEnv()
-    return SACLearner(
-        make_policy(env, num_cells=(16,)).double(), make_qvalue(env, num_cells=(16,)).double(), seed=0, **kwargs
-    )
+LR = 0.5**12  # exact in float32, in which a graph reads it
 
 
-def dynamics_learner() -> DynamicsLearner:
+def sac_learner(device: str = "cpu") -> SACLearner:
     torch.manual_seed(0)
-    return DynamicsLearner(GaussianEnsemble.for_env(ToyEnv(), num_cells=(16,)).double())
+    networks = (make(ToyEnv(), num_cells=(16,)).double().to(device) for make in (make_policy, make_qvalue))
+    learner, rng = SACLearner(*networks, lr=LR), torch.Generator().manual_seed(0)
+    learner._noise = lambda action: torch.randn(  # type: ignore[method-assign]
+        action.shape, generator=rng, dtype=action.dtype
+    ).to(action.device)
+    return learner
+
+
+def dynamics_learner(device: str = "cpu") -> DynamicsLearner:
+    torch.manual_seed(0)
+    return DynamicsLearner(GaussianEnsemble.for_env(ToyEnv(), num_cells=(16,)).double().to(device), lr=LR)
 
 
 def raise_the_rate(learner: Any) -> None:
-    learner.optimiser.param_groups[0]["lr"] = 0.5**6  # exact in float32, in which a graph reads it
+    learner.optimiser.param_groups[0]["lr"] = 0.5**6
 
 
 def schedule_the_rate(learner: Any) -> None:
@@ -114,30 +119,38 @@ OF_BOTH = [raise_the_rate, schedule_the_rate, forget_the_gradients, raise_the_be
 OF_SAC = [raise_alpha, lower_gamma, raise_tau]
 
 
-@pytest.mark.parametrize(
-    ("make", "change"),
-    [(make, change) for make in (sac_learner, dynamics_learner) for change in OF_BOTH]
-    + [(sac_learner, change) for change in OF_SAC],
-)
+EACH = [(make, change) for make in (sac_learner, dynamics_learner) for change in OF_BOTH]
+EACH += [(sac_learner, change) for change in OF_SAC]
+
+
+def changed_midway(learner: Any, change: Any, batches: TensorDict) -> dict[str, Tensor]:
+    """Weights, and targets of critics, after five updates, a change and five more."""
+    learner.update(batches[:5])
+    before = learner.state_dict()["weights"].clone()
+    change(learner)
+    learner.update(batches[5:])
+    state = learner.state_dict()
+    assert not torch.equal(state["weights"], before)
+    return {name: value.cpu() for name, value in state.items() if isinstance(value, Tensor) and name != "rng"}
+
+
+@pytest.mark.parametrize(("make", "change"), EACH)
 def test_a_captured_update_follows_what_is_changed_after_it(
     make_rows: Rows, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch, make: Any, change: Any
 ) -> None:
-    batches = make_rows(10, 8)
-    captured = make()
-    states = []
-    for learner in (captured, None):
-        if learner is None:
-            monkeypatch.undo()
-            learner = make()
-        learner.update(batches[:5])
-        before = learner.state_dict()["weights"].clone()
-        change(learner)
-        learner.update(batches[5:])
-        states.append(learner.state_dict())
-        assert not torch.equal(states[-1]["weights"], before)
+    captured = changed_midway(make(), change, make_rows(10, 8))
     assert any(len(recording.calls) > 10 for recording in recordings)
-    for name in {"weights", "targets"} & states[0].keys():
-        torch.testing.assert_close(states[0][name], states[1][name], rtol=0, atol=1e-9)
+    monkeypatch.undo()
+    torch.testing.assert_close(captured, changed_midway(make(), change, make_rows(10, 8)), rtol=0, atol=1e-9)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("make", "change"), EACH)
+def test_a_cuda_graph_follows_what_is_changed_after_it(make_rows: Rows, make: Any, change: Any) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    on_gpu, on_cpu = (changed_midway(make(device), change, make_rows(10, 8)) for device in ("cuda", "cpu"))
+    torch.testing.assert_close(on_gpu, on_cpu, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("make", [sac_learner, dynamics_learner])

@@ -15,6 +15,7 @@ from toy_env import ToyEnv
 from coim import CoImSACLoss, SACLearner, make_policy, make_qvalue, select_run
 
 Rows = Callable[..., TensorDict]
+LR = 0.5**12  # exact in float32, in which a CUDA graph reads it
 
 
 def sac_learner(num_runs: int | None = None, *, seed: int = 0, **kwargs: float) -> SACLearner:
@@ -162,6 +163,11 @@ def test_rows_that_only_the_loss_understands_are_refused(make_rows: Rows) -> Non
         learner.update(rows)
     with pytest.raises(ValueError, match=r"'priority_weight': .* train with CoImSACLoss, or exclude\(\) the key"):
         learner.update(make_rows(8).set("priority_weight", torch.ones(8)))
+    learner.loss.set_keys(priority="error")  # only written, by the loss
+    learner.update(make_rows(8))
+    learner.loss.set_keys(reward="pay")
+    with pytest.raises(ValueError, match=r"by the keys of the schema, not by {'reward': 'pay'}; rename their entries"):
+        learner.update(make_rows(8))
 
 
 @pytest.mark.parametrize("num_runs", [None, 2])
@@ -289,7 +295,7 @@ def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> N
         torch.manual_seed(0)
         policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).double().to(device)
         qvalue = make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).double().to(device)
-        learners.append(SACLearner(policy, qvalue, num_runs=num_runs))
+        learners.append(SACLearner(policy, qvalue, num_runs=num_runs, lr=LR))
     on_cpu, on_gpu = learners
     for seed in (0, 1):
         batches = make_rows(20, 32, *([num_runs] if num_runs else []), seed=seed)

@@ -16,7 +16,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule
 
 from .functional import design_value
@@ -155,10 +156,15 @@ class DesignValue(LossModule):
         return TensorDict({"design_value": value}, value.shape)
 
     def _networks_are_bare(self) -> bool:
-        """Whether both networks can be asked on bare tensors, as `coim.models.Policy` and `coim.models.QValue` can."""
+        """Whether both can be asked on bare tensors, as a `coim.models.Policy` and `coim.models.QValue` that were left
+        as they were made.
+        """
         keys = (self.tensor_keys.design, self.tensor_keys.state_action_value)
         methods = hasattr(self.policy, "deterministic_action") and hasattr(self.qvalue, "values")
-        return keys == ("design", "state_action_value") and methods
+        if keys != ("design", "state_action_value") or not methods:
+            return False
+        plain = _called_as(self.policy, ProbabilisticActor) and _called_as(self.qvalue, TensorDictModule)
+        return plain and self.policy[-1].distribution_class is TanhNormal and not self.policy[-1].distribution_kwargs
 
     def _num_chunks(self, designs: Tensor) -> int:
         rows = CHUNK_ROWS.get(designs.device.type, MANY_ROWS)
@@ -184,3 +190,9 @@ class DesignValue(LossModule):
         if not designs.isfinite().all():
             bad = (~designs.isfinite().all(-1)).nonzero().flatten().tolist()
             raise ValueError(f"designs {bad} have NaN or infinite entries; project them with design_spec.project()")
+
+
+def _called_as(module: nn.Module, kind: type[nn.Module]) -> bool:
+    """Whether calling a module is calling one of that kind: it has neither a forward of its own nor hooks."""
+    own = type(module).forward is not kind.forward or "forward" in vars(module)
+    return not (own or module._forward_hooks or module._forward_pre_hooks)

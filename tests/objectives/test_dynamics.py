@@ -120,7 +120,8 @@ def test_moving_the_loss_moves_the_ensemble(make_rows):
     rows, ensemble = make_rows(20), GaussianEnsemble(3, 2, 2, num_cells=(8,)).double()
     parameters = list(ensemble.parameters())
     loss = EnsembleNLLLoss(ensemble).float()
-    assert {p.dtype for p in ensemble.parameters()} == {ensemble.inputs.mean.dtype} == {torch.float32}
+    assert {p.dtype for p in ensemble.parameters()} == {torch.float32}
+    assert {loss.ensemble_params["inputs", "mean"].dtype} == {ensemble.inputs.mean.dtype} == {torch.float64}
     assert all(a is b is c for a, b, c in zip(parameters, ensemble.parameters(), loss.parameters()))
     ensemble.update_statistics(rows.float())
     assert loss.ensemble_params["inputs", "count"].item() == 20

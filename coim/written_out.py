@@ -1,0 +1,96 @@
+"""What the gradients written out in `coim.objectives` are right for: networks of `coim.models` as they were made, and
+rows of single steps that count alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import SafeProbabilisticModule, TanhNormal
+
+from coim.models.ensemble import GaussianEnsemble
+from coim.models.normaliser import RunningNormaliser
+from coim.models.policy import Policy, PolicyNetwork
+from coim.models.qvalue import QValue, QValueNetwork
+from coim.models.scaling import InputScaling
+from coim.models.stacked import StackedLinear, StackedMLP
+from coim.objectives.dynamics import check_one_step
+from coim.objectives.sac import CoImSACLoss
+
+STACKED = (nn.ModuleList, StackedMLP, StackedLinear)
+SAC = (Policy, PolicyNetwork, QValue, QValueNetwork, TensorDictModule, SafeProbabilisticModule, InputScaling)
+OF_SAC, OF_ENSEMBLE = (*STACKED, *SAC, nn.ReLU), (*STACKED, GaussianEnsemble, RunningNormaliser, nn.SiLU)
+
+
+def check_sac_networks(policy: Policy, qvalue: QValue) -> None:
+    """Refuse a policy or critics that compute something else, or do not see the same numbers.
+
+    Raises:
+        TypeError: naming the part that is another.
+        ValueError: if the two scale their inputs differently.
+    """
+    for network in (policy, qvalue):
+        _check_parts(network, OF_SAC, "SACLearner", "CoImSACLoss")
+    distribution, settings = policy[-1].distribution_class, policy[-1].distribution_kwargs
+    if distribution is not TanhNormal or settings:
+        raise TypeError(
+            f"SACLearner knows the gradients of a TanhNormal on [-1, 1], not of {distribution.__name__} with "
+            f"{settings}; train it with CoImSACLoss and an optimiser"
+        )
+    if not _same_scaling(policy.network.scaling, qvalue.module.scaling):
+        raise ValueError("policy and qvalue scale their inputs differently; make both for the same environment")
+
+
+def check_sac_rows(rows: TensorDictBase, keys: CoImSACLoss._AcceptedKeys) -> None:
+    """Refuse rows of which `CoImSACLoss` takes something into account that the gradients written out do not.
+
+    Args:
+        rows: ``[*B]``.
+        keys: those of the loss.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    schema = asdict(CoImSACLoss.default_keys())
+    renamed = {name: key for name, key in asdict(keys).items() if key != schema[name] and name != "priority"}
+    if renamed:
+        raise ValueError(f"SACLearner reads rows by the keys of the schema, not by {renamed}; rename their entries")
+    check_one_step(rows, keys.steps_to_next_obs)
+    if keys.priority_weight in rows.keys(True):
+        raise ValueError(
+            f"rows with {keys.priority_weight!r}: SACLearner has no importance weights; train with CoImSACLoss, or "
+            "exclude() the key to count all rows alike"
+        )
+
+
+def check_ensemble(ensemble: GaussianEnsemble) -> None:
+    """Refuse an ensemble that computes something else.
+
+    Raises:
+        TypeError: naming the part that is another.
+    """
+    _check_parts(ensemble, OF_ENSEMBLE, "DynamicsLearner", "EnsembleNLLLoss")
+
+
+def _check_parts(network: nn.Module, kinds: tuple[type[nn.Module], ...], learner: str, loss: str) -> None:
+    known = {kind.forward for kind in kinds}
+    for name, part in network.named_modules():
+        own = type(part).forward not in known or "forward" in vars(part)
+        if own or part._forward_hooks or part._forward_pre_hooks:
+            where = f"{type(network).__name__}.{name}" if name else type(network).__name__
+            raise TypeError(
+                f"{learner} knows the gradients of the networks of coim.models alone, and {where}, a "
+                f"{type(part).__name__}, has {'a forward of its own' if own else 'hooks'}; train it with {loss} and an "
+                "optimiser"
+            )
+
+
+def _same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
+    """Whether two networks see the same numbers."""
+    if one is None or other is None:
+        return one is other
+    return all(torch.equal(a, b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
