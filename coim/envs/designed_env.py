@@ -41,7 +41,7 @@ def check_step(given: Tensor | None, body: Tensor) -> None:
     Raises:
         ValueError: they differ by more than the rounding of a transform and its inverse.
     """
-    if given is None or torch.equal(given, body):
+    if given is None or given is body or torch.equal(given, body):
         return
     if given.shape == body.shape:
         close = torch.isclose(given.to(body.dtype), body, rtol=RELATIVE_ROUNDING, atol=ABSOLUTE_ROUNDING).all(-1)
@@ -80,25 +80,22 @@ def check_reset(given: TensorDictBase | None, readable: tuple[str, ...], design_
         )
 
 
-def check_reward(
-    reward: RewardFn, observation: torch.Size, action: torch.Size, design: torch.Size, *, name: str
-) -> None:
-    """Try a reward function out on zeros and a design of ones.
+def check_reward(reward: RewardFn, observation: Tensor, action: Tensor, design: Tensor, *, name: str) -> None:
+    """Try a reward function out.
 
     Args:
         reward: ``(observation, action, next_observation, design) -> [*B, 1]``.
-        observation: shape ``[*B, S]``.
-        action: shape ``[*B, A]``.
-        design: shape ``[*B, D]``.
+        observation: ``[*B, S]``, any.
+        action: ``[*B, A]``, any.
+        design: ``[*B, D]``, any.
         name: of the environment, for the sentence.
 
     Raises:
         ValueError: it does not return ``[*B, 1]`` numbers of the observation's dtype.
     """
-    steps = 2  # a whole episode is rewarded at once: one more batch dimension
-    here, torques = (torch.zeros(steps, *shape, dtype=torch.float32, device="cpu") for shape in (observation, action))
-    body = torch.ones(steps, *design, dtype=torch.float32, device="cpu")
-    found, wanted = reward(here, torques, here.clone(), body), [steps, *observation[:-1], 1]
+    # A whole episode is rewarded at once: one more batch dimension.
+    here, torques, body = (value.expand(2, *value.shape) for value in (observation, action, design))
+    found, wanted = reward(here, torques, here.clone(), body), [*here.shape[:-1], 1]
     if list(found.shape) != wanted or found.dtype != here.dtype:
         raise ValueError(
             f"the reward of {name} has shape {list(found.shape)} and dtype {found.dtype} for observations "

@@ -255,7 +255,8 @@ class MorphEnv(Fleet, DesignedEnv):
             raise ValueError(
                 f"{name}.OBSERVATION_SCALE is {scale}, not {size} positive numbers, one for each observed quantity"
             )
-        check_reward(self.reward_fn, self._observation.shape, self.action_spec.shape, self._design.shape, name=name)
+        torques = torch.zeros(self.action_spec.shape, dtype=torch.float32, device="cpu")
+        check_reward(self.reward_fn, self._observation, torques, self._design, name=name)
 
 
 def _existing(device: torch.device | str | None) -> torch.device | None:

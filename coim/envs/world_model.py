@@ -12,13 +12,18 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
+
+from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step
+from coim.randomness import restore_generator
+
+STATE_KEYS = ("observation", "design")
 
 
 class Dynamics(Protocol):
@@ -30,7 +35,7 @@ class Dynamics(Protocol):
         """Draw next observations ``[*B, S]``: h(s, a, xi) of Eq. 7."""
 
 
-class WorldModelEnv(EnvBase):
+class WorldModelEnv(DesignedEnv):
     """Not TorchRL's ``WorldModelEnv``: this one steps a learned transition model over (observation, action, design).
 
     A step asks the model for the next observation and the real environment's reward function for the reward; the design
@@ -41,10 +46,13 @@ class WorldModelEnv(EnvBase):
     goes back to the last ones given; before any were given to a made-up start: standard-normal observations and uniform
     designs, good for checking specs and little else.
 
+    The dream itself steps the states that its input holds, ``dream.step(td)``. Behind a transform it steps its own,
+    which no transform has touched, as the bodies do; a ``design`` in the input that is not its own is then refused.
+
     Args:
         ensemble: the model; its ``sample`` gives next observations.
         env: the real environment: gives the specs, ``design_spec`` and ``reward_fn``; it is not stepped. A bare one:
-            the dream knows nothing of transforms.
+            transforms are put around the dream.
         batch_size: of the dream, ``[*B]``: free to differ from ``env``'s, but a fleet of models has its run axis last.
         seed: of the dream's own random numbers (TS1, noise, made-up starts). Drawn from torch if unset.
 
@@ -52,7 +60,9 @@ class WorldModelEnv(EnvBase):
         rng: the dream's own generator; its state is all that a dream carries from one call of `advance` to the next.
 
     Raises:
-        ValueError: if a start state has an entry that is not finite, or a design that leaves the bounds.
+        TypeError: if ``env`` is a TransformedEnv.
+        ValueError: if a start state has an entry that is not finite, or a design that leaves the bounds, or if the
+            reward of ``env`` is not ``[*B, 1]``.
 
     Example:
         >>> from coim import GaussianEnsemble, HopperMorph
@@ -64,14 +74,28 @@ class WorldModelEnv(EnvBase):
     """
 
     def __init__(self, ensemble: Dynamics, env: EnvBase, *, batch_size: Sequence[int], seed: int | None = None) -> None:
+        if isinstance(env, TransformedEnv):
+            raise TypeError(
+                "model and reward are of what the bodies themselves observe: pass env.base_env to the dream, and put "
+                "the transforms around it, TransformedEnv(dream, ...)"
+            )
         super().__init__(device=env.device, batch_size=torch.Size(batch_size))
         self.ensemble = ensemble
         self.reward_fn = env.reward_fn
         self.design_spec: Bounded = env.design_spec
         self._make_specs(env)
+        single = self.full_observation_spec_unbatched
+        check_reward(
+            self.reward_fn,
+            single["observation"].zero(),
+            self.full_action_spec_unbatched["action"].zero(),
+            self.design_spec.space.low,
+            name=type(env).__name__,
+        )
         self.rng = torch.Generator(self.device or "cpu")
-        self._set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+        self._set_seed(int(torch.randint(2**31, (), device="cpu")) if seed is None else seed)
         self._start = TensorDict({}, self.batch_size, device=self.device)
+        self._state: TensorDict | None = None  # where it is, before any transform
 
     def advance(
         self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
@@ -91,23 +115,72 @@ class WorldModelEnv(EnvBase):
         next_observation = self.ensemble.sample(observation, action, design, generator=rng)
         return next_observation, self.reward_fn(observation, action, next_observation, design)
 
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Step the states that the tensordict holds, ``observation`` and ``design``; its own where one is missing."""
+        self._assert_tensordict_shape(tensordict)
+        given = tensordict.select(*STATE_KEYS, strict=False)
+        own = {} if set(STATE_KEYS) <= set(given.keys()) else self._present()
+        self._state = TensorDict({**own, **given}, self.batch_size, device=self.device)
+        return super().step(tensordict)
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        design = tensordict["design"]
-        next_observation, reward = self.advance(tensordict["observation"], tensordict["action"], design)
-        done = self.full_done_spec.zero()
-        return done.update({"observation": next_observation, "design": design, "reward": reward})
+        observation, design = (self._present()[key] for key in STATE_KEYS)
+        check_step(tensordict.get("design", None), design)
+        seen = tensordict.get("observation", None)
+        if seen is not None and not seen.requires_grad:  # the caller has cut the gradient: no graph grows in here
+            observation = observation.detach()
+        next_observation, reward = self.advance(observation, tensordict["action"], design)
+        after = TensorDict({"observation": next_observation, "design": design}, self.batch_size, device=self.device)
+        self._state = after.clone()  # ours; what is handed out may be written to
+        return self.full_done_spec.zero().update(after).set("reward", reward)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        check_reset(tensordict, STATE_KEYS, self.observation_spec["design"].shape)
+        everywhere = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        which = everywhere
         if tensordict is not None:
-            given = tensordict.select("observation", "design", strict=False)
-            everywhere = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+            given = tensordict.select(*STATE_KEYS, strict=False)
             which = tensordict.get("_reset", everywhere).reshape(self.batch_size)
             self._check_start(given, which)
             # Rows that are not reset keep the start that they had; EnvBase.reset leaves their state as it is.
             kept = given if which.all() else self._begun().select(*given.keys())
             self._start.update(given.where(which, kept))
         self._start = self._begun()
-        return self.full_done_spec.zero().update(self._start.clone())
+        self._state = self._start.clone() if which.all() else self._start.where(which, self._present())
+        answer = self.full_done_spec.zero().update(self._state.clone())
+        if tensordict is not None and "_reset" in tensordict:
+            # For rows that are not reset TorchRL answers with the caller's values, and with zeros if there are none.
+            tensordict.update(self._state.exclude(*tensordict.keys()).clone())
+        return answer
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move the dream, its model and its random numbers, which are others on another kind of device."""
+        super().to(device)
+        state, self.rng = self.rng.get_state(), torch.Generator(self.device or "cpu")
+        restore_generator(self.rng, state)
+        self.design_spec, self._start = self.design_spec.to(device), self._start.to(device)
+        self._state = None if self._state is None else self._state.to(device)
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of it for pickle and deepcopy; the states without the graph that led to them."""
+        state = super().__getstate__() | {
+            "rng": (self.rng.device, self.rng.get_state()),
+            "_start": self._start.detach(),
+        }
+        return state | {"_state": None if self._state is None else self._state.detach()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        device, generator_state = state.pop("rng")
+        super().__setstate__(state)
+        self.rng = torch.Generator(device)
+        restore_generator(self.rng, generator_state)
+
+    def _present(self) -> TensorDict:
+        """Where the rows are: at their starts, before any reset."""
+        if self._state is None:
+            self._state = self._begun().clone()
+        return self._state
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
