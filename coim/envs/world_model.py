@@ -83,6 +83,8 @@ class WorldModelEnv(DesignedEnv):
         self.ensemble = ensemble
         self.reward_fn = env.reward_fn
         self.design_spec: Bounded = env.design_spec
+        self.observation_scale: Tensor | None = getattr(env, "observation_scale", None)
+        self.angle_indices: tuple[int, ...] = getattr(env, "angle_indices", ())
         self._make_specs(env)
         single = self.full_observation_spec_unbatched
         check_reward(

@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase
 
 from coim.angles import wrap_angle
 
+from .bodies import body_of, design_bounds
 from .normaliser import RunningNormaliser
 from .stacked import StackedMLP
 
@@ -122,26 +123,43 @@ class GaussianEnsemble(TensorDictModuleBase):
         design, or two near ones, the running statistics alone would magnify any other design beyond all data.
 
         Args:
-            env: anything with ``observation_spec["observation"]``, ``design_spec``, ``action_spec`` and, where the
-                observation has angles in (-pi, pi] rad, ``angle_indices``.
+            env: anything with ``observation_spec``, ``action_spec`` and bounds of the design, in the observation's spec
+                or as ``design_spec``; where entries of the observation are angles in (-pi, pi] rad, the body inside of
+                it has ``angle_indices``.
             num_members: ``E``.
             num_cells: units of each hidden layer.
             predict: ``"delta"`` or ``"next"``.
             num_runs: ``K``, or None for a single run.
+
+        Returns:
+            An ensemble on the device and in the dtype of the observations; its weights are drawn on the CPU.
+
+        Raises:
+            ValueError: if a transform rewrites observations in which there are angles, or the workers of ``env`` are
+                not alike.
         """
-        space = env.design_spec.space
-        bounded = space is not None and bool((space.high - space.low).isfinite().all())
-        return cls(
-            env.observation_spec["observation"].shape[-1],
-            env.action_spec.shape[-1],
-            env.design_spec.shape[-1],
-            num_members=num_members,
-            num_cells=num_cells,
-            predict=predict,
-            angle_indices=getattr(env, "angle_indices", ()),
-            min_design_std=(space.high - space.low).cpu() / math.sqrt(12) if bounded else None,
-            num_runs=num_runs,
-        )
+        seen = env.observation_spec["observation"]
+        body, rewritten = body_of(env)
+        angle_indices = getattr(body, "angle_indices", ())
+        if rewritten and angle_indices:
+            raise ValueError(
+                f"entries {list(angle_indices)} of the observation are angles, and a transform rewrites them; model "
+                "the environment without its transforms, `env.base_env`"
+            )
+        low, high, bounded = design_bounds(env)
+        with torch.device("cpu"):
+            ensemble = cls(
+                seen.shape[-1],
+                env.action_spec.shape[-1],
+                len(low),
+                num_members=num_members,
+                num_cells=num_cells,
+                predict=predict,
+                angle_indices=angle_indices,
+                min_design_std=((high - low) / math.sqrt(12)).where(bounded, 0.0),
+                num_runs=num_runs,
+            )
+        return ensemble.to(seen.device, seen.dtype)
 
     @property
     def num_runs(self) -> int | None:

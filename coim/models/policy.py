@@ -142,13 +142,18 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
     """Build a policy that fits an environment (Sec. 6.1: three hidden layers of 200 units).
 
     Args:
-        env: anything with ``observation_spec["observation"]``, ``design_spec`` and ``action_spec``; only the sizes of
-            their last dimensions and the bounds are read, and ``observation_scale`` if there is one.
+        env: anything with ``observation_spec``, ``action_spec`` and bounds of the design, in the observation's spec or
+            as ``design_spec``: a body, its dream, or one of these inside of transforms, `SerialEnv` or `ParallelEnv`.
+            What the inputs are scaled by is the same for all of them, see :meth:`InputScaling.for_env`.
         num_cells: units of each hidden layer.
         num_runs: ``K`` independent policies in one; the last batch dimension of their input is then the run axis.
 
+    Returns:
+        A policy on the device and in the dtype of the observations. Weights are drawn on the CPU: the same seed gives
+        the same policy on each device.
+
     Raises:
-        ValueError: if the actions of ``env`` are not bounded by -1 and 1.
+        ValueError: if the actions of ``env`` are not bounded by -1 and 1, or its workers are not alike.
 
     Example:
         >>> policy = Policy(PolicyNetwork(17, 6, 6))
@@ -159,12 +164,14 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
     space = env.action_spec.space
     if space is None or not (torch.all(space.low == -1) and torch.all(space.high == 1)):
         raise ValueError(f"a tanh acts in [-1, 1], not in {space}; rescale with torchrl.envs.ActionScaling")
-    network = PolicyNetwork(
-        env.observation_spec["observation"].shape[-1],
-        env.design_spec.shape[-1],
-        env.action_spec.shape[-1],
-        num_cells=num_cells,
-        num_runs=num_runs,
-        scaling=InputScaling.for_env(env),
-    )
-    return Policy(network)
+    seen, scaling = env.observation_spec["observation"], InputScaling.for_env(env)
+    with torch.device("cpu"):
+        network = PolicyNetwork(
+            seen.shape[-1],
+            len(scaling.design_centre),
+            env.action_spec.shape[-1],
+            num_cells=num_cells,
+            num_runs=num_runs,
+            scaling=scaling,
+        )
+    return Policy(network.to(seen.device, seen.dtype))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -88,12 +89,17 @@ def make_qvalue(
     """Build critics that fit an environment (Sec. 6.1: three hidden layers of 200 units).
 
     Args:
-        env: anything with ``observation_spec["observation"]``, ``design_spec`` and ``action_spec``; only the sizes of
-            their last dimensions and the design's bounds are read, and ``observation_scale`` if there is one.
+        env: as for :func:`~coim.models.make_policy`; its actions may have any bounds.
         num_critics: ``N``; two in the double-Q approach of Sec. 4.
         num_cells: units of each hidden layer.
         num_runs: ``K`` independent sets of critics in one; the last batch dimension of their input is then the run
             axis.
+
+    Returns:
+        Critics on the device and in the dtype of the observations; their weights are drawn on the CPU.
+
+    Raises:
+        ValueError: if the workers of ``env`` are not alike.
 
     Example:
         >>> import torch
@@ -101,13 +107,15 @@ def make_qvalue(
         >>> qvalue.module(torch.zeros(256, 17), torch.zeros(256, 6), torch.ones(256, 6)).shape
         torch.Size([256, 2])
     """
-    network = QValueNetwork(
-        env.observation_spec["observation"].shape[-1],
-        env.action_spec.shape[-1],
-        env.design_spec.shape[-1],
-        num_critics=num_critics,
-        num_cells=num_cells,
-        num_runs=num_runs,
-        scaling=InputScaling.for_env(env),
-    )
-    return QValue(network)
+    seen, scaling = env.observation_spec["observation"], InputScaling.for_env(env)
+    with torch.device("cpu"):
+        network = QValueNetwork(
+            seen.shape[-1],
+            env.action_spec.shape[-1],
+            len(scaling.design_centre),
+            num_critics=num_critics,
+            num_cells=num_cells,
+            num_runs=num_runs,
+            scaling=scaling,
+        )
+    return QValue(network.to(seen.device, seen.dtype))

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from .bodies import body_of, design_bounds
+
 
 class InputScaling(nn.Module):
     """Observations over their typical spread, designs from their bounds to [-1, 1].
@@ -21,6 +23,7 @@ class InputScaling(nn.Module):
         observation_scale: typical spread of each entry, ``[S]``.
         low: least design, ``[D]``.
         high: greatest design, ``[D]``.
+        bounded: which entries of the design have both bounds, ``[D]``; the others are left as they are. None: all.
 
     Raises:
         ValueError: if a spread or a range is not positive.
@@ -36,7 +39,7 @@ class InputScaling(nn.Module):
     design_centre: Tensor
     design_reach: Tensor
 
-    def __init__(self, observation_scale: Tensor, low: Tensor, high: Tensor) -> None:
+    def __init__(self, observation_scale: Tensor, low: Tensor, high: Tensor, *, bounded: Tensor | None = None) -> None:
         super().__init__()
         if not (observation_scale > 0).all():
             raise ValueError(
@@ -45,17 +48,29 @@ class InputScaling(nn.Module):
         if not (high > low).all():
             raise ValueError(f"design bounds {low.tolist()} and {high.tolist()} must leave a range in every entry")
         self.register_buffer("observation_scale", observation_scale.clone())
-        self.register_buffer("design_centre", (high + low) / 2)
-        self.register_buffer("design_reach", (high - low) / 2)
+        bounded = torch.ones_like(low, dtype=torch.bool) if bounded is None else bounded
+        self.register_buffer("design_centre", ((high + low) / 2).where(bounded, 0.0))
+        self.register_buffer("design_reach", ((high - low) / 2).where(bounded, 1.0))
 
     @classmethod
     def for_env(cls, env: EnvBase) -> InputScaling:
-        """The scaling of an environment: its ``observation_scale`` (none: all ones) and its ``design_spec``."""
-        scale = getattr(env, "observation_scale", None)
-        if scale is None:
-            scale = torch.ones(env.observation_spec["observation"].shape[-1])
-        bounds = env.design_spec.space
-        return cls(scale, bounds.low, bounds.high)
+        """The scaling of an environment: the ``observation_scale`` of its body and the bounds of its designs.
+
+        It is the same for a body, for its dream, and for both inside of transforms or of several workers. Observations
+        are left as they are where the body has no constants, and where a transform rewrites them: these are no longer
+        the body's, and `ObservationNorm` or `VecNorm` has scaled them already.
+
+        Args:
+            env: as for :func:`~coim.models.make_policy`.
+
+        Raises:
+            ValueError: as :func:`~coim.models.bodies.body_of` and :func:`~coim.models.bodies.design_bounds`.
+        """
+        body, rewritten = body_of(env)
+        scale = None if rewritten else getattr(body, "observation_scale", None)
+        low, high, bounded = design_bounds(env)
+        scale = low.new_ones(env.observation_spec["observation"].shape[-1]) if scale is None else scale.to(low)
+        return cls(scale, low, high, bounded=bounded)
 
     def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
         """Scale both, ``[*B, S]`` and ``[*B, D]``."""

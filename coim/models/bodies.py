@@ -1,0 +1,58 @@
+"""What networks must know of the body in an environment, through whatever the environment is wrapped in.
+
+Shapes: ``D`` design.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+
+def body_of(env: EnvBase) -> tuple[EnvBase, bool]:
+    """Find the environment inside of transforms and of `SerialEnv` or `ParallelEnv`.
+
+    Args:
+        env: any environment; what is not wrapped is its own body. Of the workers of a batched one, another of each is
+            made to look at; torch's global generator stays as it is.
+
+    Returns:
+        The bare environment, and whether a transform rewrites its ``observation``.
+
+    Raises:
+        ValueError: if the workers have bodies of different classes, or some have transforms that others have not.
+    """
+    if isinstance(env, TransformedEnv):
+        body, rewritten = body_of(env.base_env)
+        transforms = [part for part in env.transform.modules() if isinstance(part, Transform)]
+        return body, rewritten or any("observation" in transform.out_keys for transform in transforms)
+    if isinstance(env, BatchedEnvBase):
+        with torch.random.fork_rng(devices=[]):
+            workers = [body_of(make(**given)) for make, given in zip(env.create_env_fn, env.create_env_kwargs)]
+        kinds = {(type(body).__name__, "rewritten" if rewritten else "bare") for body, rewritten in workers}
+        if len(kinds) > 1:
+            raise ValueError(f"the workers have unlike bodies, {sorted(kinds)}; make the networks for one of them")
+        return workers[0]
+    return env, False
+
+
+def design_bounds(env: EnvBase) -> tuple[Tensor, Tensor, Tensor]:
+    """Bounds of the design as networks see it: where the observation has it, transforms included.
+
+    Args:
+        env: with ``design`` in its ``observation_spec``, or with ``design_spec``.
+
+    Returns:
+        Least and greatest design and which entries have both bounds, each ``[D]``.
+
+    Raises:
+        ValueError: if the bounds are not the same in all rows of the environment.
+    """
+    spec = env.observation_spec["design"] if "design" in env.observation_spec.keys() else env.design_spec  # noqa: SIM118
+    low, high = (bound.reshape(-1, spec.shape[-1]) for bound in (spec.space.low, spec.space.high))
+    if not ((low == low[0]).all() and (high == high[0]).all()):
+        raise ValueError(f"designs have other bounds in other rows, {low.tolist()} to {high.tolist()}; make them alike")
+    limits = torch.finfo(low.dtype)
+    return low[0], high[0], (low[0] > limits.min) & (high[0] < limits.max)
