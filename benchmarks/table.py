@@ -29,7 +29,7 @@ def machine() -> dict[str, Any]:
         "processor": _processor(),
         "cores": available_cores(),
         "threads": torch.get_num_threads(),
-        "load before": round(os.getloadavg()[0], 2),
+        "load before": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "widest instructions": torch.backends.cpu.get_cpu_capability(),
         "system": platform.platform(),
         "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES} | others,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
+import platform
 import signal
 import sys
 import threading
@@ -12,8 +12,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import IO
 
 from recipes.writing import FULL, NOT_OFFERED, telling_full_disk, warn_once
+
+try:
+    import fcntl
+except ImportError:  # not a Unix
+    fcntl = None  # type: ignore[assignment]
 
 LOCK = ".lock"
 PATIENCE = 3  # s
@@ -126,7 +132,7 @@ def locked(folder: Path) -> Iterator[None]:
         raise cannot_write(folder, error) from error
     with lock as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            take_lock(file)
         except BlockingIOError:
             file.seek(0)
             owner = file.read().strip() or "another process"
@@ -140,8 +146,20 @@ def locked(folder: Path) -> Iterator[None]:
             )
         with telling_full_disk(folder / LOCK):
             file.truncate(0)
-            os.write(file.fileno(), f"process {os.getpid()} on {os.uname().nodename}".encode())
+            os.write(file.fileno(), f"process {os.getpid()} on {platform.node()}".encode())
         yield
+
+
+def take_lock(file: IO[str]) -> None:
+    """Lock a file until it is closed.
+
+    Raises:
+        BlockingIOError: if another process has it.
+        OSError: if there are no locks here.
+    """
+    if fcntl is None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def cannot_write(folder: Path, error: OSError) -> OSError:

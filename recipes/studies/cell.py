@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import os
+import platform
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -33,7 +34,7 @@ def compute(environment: str, settings: Settings, log: Path) -> None:
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", buffering=1) as words, redirect_stdout(words), redirect_stderr(words):
-        print(f"{STARTED} {now()} on {os.uname().nodename}, process {os.getpid()}")
+        print(f"{STARTED} {now()} on {platform.node()}, process {os.getpid()}")
         try:
             run(BODIES[environment], environment, to_go_on(settings))
         except BaseException:

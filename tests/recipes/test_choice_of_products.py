@@ -13,7 +13,7 @@ from interrupted_runs import cut, resume, run
 from coim import HopperMorph, products
 from coim.products import Choice
 from recipes.experiment import main
-from recipes.machine import choose_products
+from recipes.machine import choose_products, keep_freed_memory
 
 NARROW = Choice("torch", "emulated")  # every machine can
 
@@ -104,3 +104,14 @@ def test_a_library_that_is_not_here_is_one_sentence(tmp_path: Path, monkeypatch:
     with pytest.raises(SystemExit, match="no oneDNN; choose products 'torch' or 'auto'"):
         main(HopperMorph, "hopper", ["--products", "onednn", "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("error", [ImportError, OSError, AttributeError, TypeError])
+def test_without_an_allocator_that_can_be_told_nothing_is_told(
+    monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
+    def missing(name: object) -> None:
+        raise error
+
+    monkeypatch.setattr("ctypes.CDLL", missing)
+    keep_freed_memory()

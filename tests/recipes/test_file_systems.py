@@ -53,6 +53,15 @@ def fsync_of_files_only(number: int) -> Callable[[int], None]:
     return fsync
 
 
+def test_a_system_without_locks_at_all_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("recipes.interrupt.fcntl", None)
+    with locked(tmp_path):
+        pass
+    assert f"warning: {tmp_path} cannot be locked" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP])
 @pytest.mark.parametrize("no_lock", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
 def test_a_file_system_without_locks_and_synced_folders_is_told_once(
