@@ -25,6 +25,7 @@ from benchmarks.search import search
 from benchmarks.updates import torchrl, update
 from recipes.interrupt import on_command_line
 from recipes.machine import available_cores, prepare
+from recipes.writing import dated_file
 
 Row = Literal[
     "products",
@@ -54,7 +55,6 @@ ROWS: dict[Row, Callable[[Effort], list[Figure]]] = {
     "iteration": iteration,
     "memory": memory,
 }
-DEFAULT_OUT = Path("docs/results/benchmarks.json")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Options:
     quick: bool = False
     """Fewer repeats and smaller sizes: a first look, not a result."""
     out: Path | None = None
-    """JSON file; by default docs/results/benchmarks.json for the whole table, and none for a part or a quick look."""
+    """JSON file; by default runs/benchmarks-DATE.json for the whole table, and none for a part or a quick look."""
 
 
 def main(options: Options) -> None:
@@ -84,9 +84,10 @@ def main(options: Options) -> None:
         print("a quick look: sizes are smaller than those that the targets are meant for")
     print(table.text(figures))
     whole = set(options.only) == set(ROWS) and not options.quick
-    out = options.out or (DEFAULT_OUT if whole else None)
+    out = dated_file("benchmarks", ".json") if whole and options.out is None else options.out
     if out is not None:
         table.write(out, found, figures)
+        print(f"written to {out}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Train what the design searches are measured on: ``python -m benchmarks.train_networks`` (five minutes).
 
 Algorithm 1 without imagination: two short episodes on each of many designs, and a population that learns more than it
-usually would in so few. The weights under ``benchmarks/data/`` are its own, written with the defaults.
+usually would in so few. The weights under ``benchmarks/data/`` are its own, made with the defaults and
+``--out benchmarks/data``.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import tyro
 
-from benchmarks.networks import FOLDER, TRAINED, save
+from benchmarks.networks import TRAINED, save
 from coim import EpisodeDone
 from coim.envs import BODIES
 from recipes.interrupt import on_command_line
@@ -32,7 +33,7 @@ class Training:
     """Training episodes on each."""
     updates: int = 400
     """Population updates after each episode."""
-    out: Path = FOLDER
+    out: Path = Path("runs/networks")
     """Where the files go."""
 
 

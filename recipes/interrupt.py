@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO
 
-from recipes.writing import FULL, NOT_OFFERED, telling_full_disk, warn_once
+from recipes.writing import FULL, NOT_OFFERED, READ_ONLY, telling_full_disk, warn_once
 
 try:
     import fcntl
@@ -23,7 +23,6 @@ except ImportError:  # not a Unix
 
 LOCK = ".lock"
 PATIENCE = 3  # s
-READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class Stopped(KeyboardInterrupt):

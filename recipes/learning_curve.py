@@ -39,7 +39,7 @@ COLUMNS = ["arm", "seed", "episode", "return"]
 class Curve:
     """Learning curves on Half-Cheetah's unit body."""
 
-    out: Path = Path("docs/results/learning_curve")
+    out: Path = Path("runs/learning_curve")
     """Folder for curves.csv, summary.csv and curves.png; seeds that are in curves.csv already are not run again."""
     arms: tuple[Literal["model-free", "known designs imagined", "model-free in bfloat16"], ...] = (
         "model-free",

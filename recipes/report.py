@@ -17,12 +17,13 @@ import tyro
 
 from coim import MorphEnv
 from coim.envs import BODIES
+from recipes.bodies import imported_body
 from recipes.interrupt import on_command_line
 from recipes.reporting import diagnostics, figures
 from recipes.reporting.figures import Picture
 from recipes.reporting.page import FONT, image, note, page, section, table
 from recipes.reporting.records import Record, Row, number, read_records
-from recipes.writing import write_whole
+from recipes.writing import dated_file, naming_out, write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,14 +33,16 @@ class Report:
     folders: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders of one environment."""
     out: Path | None = None
-    """The page; by default report.html in the first folder."""
+    """The page, or a folder for it; by default report.html in the run's folder; of several, runs/comparison-DATE.html."""
+    body: str | None = None
+    """Class of the body as module:Class, if it is not one of ours: else its bodies are not drawn."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     asked = tyro.cli(Report, prog="python -m recipes.report", args=arguments)
     with on_command_line(own_process=arguments is None):
-        print(write_report(asked.folders, out=asked.out))
+        print(write_report(asked.folders, out=asked.out, body=imported_body(asked.body)))
 
 
 def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type[MorphEnv] | None = None) -> Path:
@@ -47,7 +50,8 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
 
     Args:
         folders: of the runs, at least one.
-        out: the page; by default ``report.html`` in the first folder.
+        out: the page, or a folder for it; by default ``report.html`` in the run's folder. That is the page of one run:
+            a comparison is called otherwise, ``runs/comparison-DATE.html`` by default.
         body: what the designs belong to; by default what the environment's name says, and if no such environment is
             known the bodies are not drawn.
 
@@ -56,20 +60,29 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
 
     Raises:
         ValueError: if there is no folder, one is no run or has no rows yet, or their environments differ.
+        OSError: if the page cannot be written.
     """
     if not folders:
         raise ValueError("no folder is named; give at least one, such as runs/hopper-20260101-120000-run")
     records = read_records(folders)
     body = body or BODIES.get(records[0].environment)
-    path = out or folders[0] / "report.html"
-    if path.is_dir():
-        path = path / "report.html"
     with mpl.rc_context(FONT):
         sections = [in_short(records), *(show(picture) for picture in pictures_of(records, body)), *in_full(records)]
-    path.parent.mkdir(parents=True, exist_ok=True)
     title = f"{records[0].environment}: {', '.join(record.name for record in records)}"
-    write_whole(path, page(title, sections))
+    path = place_of(out, folders)
+    with naming_out(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, page(title, sections))
     return path
+
+
+def place_of(out: Path | None, folders: Sequence[Path]) -> Path:
+    """Where a page goes, as `write_report` says."""
+    if len(folders) == 1:
+        out = out or folders[0]
+    elif out is None:
+        return dated_file("comparison", ".html")
+    return out / ("report.html" if len(folders) == 1 else "comparison.html") if out.is_dir() else out
 
 
 def pictures_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[Picture]:

@@ -28,6 +28,7 @@ from recipes.experiment import run
 from recipes.interrupt import on_command_line
 from recipes.results import Table
 from recipes.settings import Settings
+from recipes.writing import dated_file
 
 SMALL = Settings(
     num_designs=7,
@@ -65,18 +66,22 @@ class Soak:
     """Runs that are killed; each kind of run in turn."""
     seed: int = 0
     """Seeds the moments."""
-    out: Path = Path("docs/results/soak.csv")
-    """Table with a row for each kill."""
+    out: Path | None = None
+    """Table with a row for each kill; by default runs/soak-DATE.csv."""
 
 
 def main(soak: Soak) -> None:
     """Run, kill, resume, compare, write and print."""
     draw, identical = random.Random(soak.seed), 0
-    soak.out.parent.mkdir(parents=True, exist_ok=True)
-    table = Table(soak.out, ["kill", "kind", "killed_after_s", "last_checkpoint_s", "checkpoints_before", "identical"])
+    out = soak.out or dated_file("soak", ".csv")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    table = Table(out, ["kill", "kind", "killed_after_s", "last_checkpoint_s", "checkpoints_before", "identical"])
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        seconds = {kind: left_alone(folder / kind, settings) for kind, settings in KINDS.items()}
+        seconds = {}
+        for kind, settings in KINDS.items():
+            print(f"{kind}: a run in peace", flush=True)
+            seconds[kind] = left_alone(folder / kind, settings)
         for i in range(soak.kills):
             kind = list(KINDS)[i % len(KINDS)]
             moment = draw.uniform(0, seconds[kind])
@@ -87,7 +92,7 @@ def main(soak: Soak) -> None:
             row = [i + 1, kind, f"{moment:.3f}", f"{seconds[kind]:.3f}", before, not different]
             table.append([row])
             print(*row, *different[:3], sep="  ", flush=True)
-    print(f"{identical} of {soak.kills} identical")
+    print(f"{identical} of {soak.kills} identical -> {out}")
 
 
 def left_alone(folder: Path, settings: Settings) -> float:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import functools
+import itertools
 import os
 import stat
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 
 ASIDE = ".new-{}"  # a file's name until it is whole
 FULL = {errno.ENOSPC, errno.EDQUOT}
+READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
 NOT_OFFERED = {errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}  # by a file system: a network's, a container's
 PROBE = 1 << 16  # bytes
 
@@ -54,6 +57,38 @@ def written_aside(path: Path) -> Iterator[Path]:
             sync(path.parent)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def dated_file(kind: str, suffix: str) -> Path:
+    """Make an empty file ``runs/KIND-DATE`` that nobody else has, with ``-2``, ``-3``, ... where another was quicker.
+
+    Raises:
+        OSError: if it cannot be made.
+    """
+    stem, folder = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}", Path("runs")
+    with naming_out(folder):
+        folder.mkdir(exist_ok=True)
+        for i in itertools.count(1):
+            path = folder / f"{stem}{f'-{i}' if i > 1 else ''}{suffix}"
+            with suppress(FileExistsError):
+                path.touch(exist_ok=False)
+                break
+    return path
+
+
+@contextmanager
+def naming_out(place: Path) -> Iterator[None]:
+    """Name the way out where a place of ours, such as a folder of a colleague's run, may not be written to.
+
+    Raises:
+        OSError: that names it; every other error stays what it is.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in READ_ONLY:
+            raise
+        raise OSError(f"{place} cannot be written to ({error.strerror}); name another place with --out") from error
 
 
 @contextmanager

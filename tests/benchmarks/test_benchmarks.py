@@ -183,6 +183,9 @@ def test_the_program_prints_one_table_and_writes_json(
     main(Options(only=("products",)))
     assert "products of an update, 1 thread, bfloat16 emulated" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []  # a part is no result
+    monkeypatch.setattr("benchmarks.__main__.ROWS", {"products": ROWS["products"]})  # as if that were all
+    main(Options(only=("products",)))
+    assert [path.parent.name for path in tmp_path.rglob("benchmarks-*.json")] == ["runs"]
     main(Options(only=("products",), out=tmp_path / "found" / "part.json"))
     content = json.loads((tmp_path / "found" / "part.json").read_text())
     assert content["machine"].keys() >= {"processor", "cores", "threads", "versions", "revision"}

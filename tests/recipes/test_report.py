@@ -112,6 +112,59 @@ def test_the_end_of_a_run_writes_a_page_with_every_picture_beside_the_old_one(ru
     assert "(n = 6 designs)" in page.words  # the first is built without a prediction
 
 
+def test_a_comparison_is_a_page_of_its_own(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    both, own = [str(runs / "one"), str(runs / "fleet")], runs / "one" / "report.html"
+    before = own.read_bytes()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda _: "20260101-120000")  # two comparisons in one second
+    for _ in range(2):
+        main(both)
+    said = [f"runs/comparison-20260101-120000{more}.html" for more in ("", "-2")]
+    assert capsys.readouterr().out.split() == said
+    main([*both, "--out", str(runs / "one")])
+    assert capsys.readouterr().out.split() == [str(runs / "one" / "comparison.html")]
+    for path in (*said, runs / "one" / "comparison.html"):
+        assert check(Path(path)).headings[0] == "Best returns"
+    assert own.read_bytes() == before
+
+
+def test_a_folder_in_which_only_others_may_write_is_answered_by_out(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, contents: str) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("recipes.report.write_whole", refuse)
+    with pytest.raises(SystemExit, match=r"report.html cannot be written to \(Permission denied\).* with --out"):
+        main([str(runs / "one")])
+
+
+def test_a_body_that_is_not_ours_is_drawn_if_its_class_is_named(runs: Path, tmp_path: Path) -> None:
+    theirs = shutil.copytree(runs / "one", tmp_path / "theirs")
+    config = json.loads((theirs / "config.json").read_text())
+    (theirs / "config.json").write_text(json.dumps(config | {"environment": "their_hopper"}))
+    main([str(theirs)])
+    without = len(check(theirs / "report.html").images)
+    main([str(theirs), "--body", "coim.envs.hopper:HopperMorph"])
+    assert len(check(theirs / "report.html").images) == without + 1
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        ("their_hopper", "it must be module:Class"),
+        ("nowhere.hopper:Hopper", "cannot be found .*; start from the folder in which nowhere.hopper lies"),
+        ("coim.envs.hopper:Hopper", "cannot be found"),
+        ("pathlib:Path", "name a class that is derived from coim.MorphEnv"),
+    ],
+)
+def test_what_is_no_body_is_refused(runs: Path, body: str, sentence: str) -> None:
+    with pytest.raises(SystemExit, match=f"ValueError: --body .*{sentence}"):
+        main([str(runs / "one"), "--body", body])
+
+
 def test_a_fleet_shows_the_mean_and_each_run(runs: Path) -> None:
     page = check(runs / "fleet" / "report.html")
     assert all(f"run {run}" in page.words for run in range(3))

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.train_networks import Training
 from recipes import soak
+from recipes.learning_curve import Curve
 from recipes.settings import Settings
 
 
@@ -30,6 +32,19 @@ def test_every_kill_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     assert [row["kind"] for row in rows] == ["known designs", "fleet", "baseline", "compiled", "known designs"]
     assert made == [*soak.KINDS.values(), soak.SMALL]
     assert "4 of 5 identical" in capsys.readouterr().out
+
+
+def test_no_command_writes_over_the_results_that_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(soak, "left_alone", lambda folder, settings: 9.0)
+    for _ in range(2):
+        soak.main(soak.Soak(kills=0))
+    assert len(list((tmp_path / "runs").glob("soak-*.csv"))) == 2
+    assert "known designs: a run in peace" in capsys.readouterr().out
+    for out in (Curve().out, Training().out):
+        assert out.parent == Path("runs")
 
 
 def test_what_differs_is_named() -> None:
