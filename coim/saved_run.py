@@ -5,9 +5,7 @@ Shapes: T steps, K runs, D design.
 
 from __future__ import annotations
 
-import csv
 import json
-import math
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -25,6 +23,7 @@ from coim.episode import run_episode
 from coim.events import Kind
 from coim.flat import views
 from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, select_run
+from coim.tables import DESIGN_PREFIX, OF_RUN, read_table
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
@@ -230,20 +229,21 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_designs(folder: Path) -> tuple[TriedDesign, ...]:
-    """Rows of ``designs.csv``; a last line that is still being written is left out."""
+    """Rows of ``designs.csv``; a last line that is still being written is left out.
+
+    Raises:
+        ValueError: if somebody has changed it so that it cannot be read; see `coim.tables.read_table`.
+    """
     path = folder / "designs.csv"
-    if not path.is_file():
-        return ()
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
+    rows: list[dict[str, Any]] = read_table(path, OF_RUN[path.name])
     return tuple(
         TriedDesign(
-            run=int(row["run"]),
-            number=int(row["design"]),
-            kind=cast(Kind, row["kind"]),
-            design=torch.tensor([float(cell) for name, cell in row.items() if name.startswith("xi_")]),
-            predicted=float(row["predicted"] or math.nan),
-            best_return=float(row["best_return"] or math.nan),
+            run=row["run"],
+            number=row["design"],
+            kind=row["kind"],
+            design=torch.tensor([cell for name, cell in row.items() if name.startswith(DESIGN_PREFIX)]),
+            predicted=row["predicted"],
+            best_return=row["best_return"],
             diverged=row.get("diverged", ""),
         )
         for row in rows

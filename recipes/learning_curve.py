@@ -19,6 +19,7 @@ import torch
 import tyro
 
 from coim import EpisodeDone, HalfCheetahMorph, run_episode
+from coim.tables import Layout, read_cells
 from recipes.interrupt import on_command_line
 from recipes.machine import available_cores, checked_device, prepare
 from recipes.parts import build
@@ -124,9 +125,8 @@ def summarise(curve: Curve, rows: list[dict[str, str]]) -> None:
 
 
 def read(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    """Rows of ``curves.csv``."""
+    return read_cells(path, Layout(needed=tuple(COLUMNS), words=("arm",), counts=("seed", "episode")))
 
 
 def write(path: Path, rows: list[list]) -> None:

@@ -21,11 +21,11 @@ from typing import Any
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
 from coim.products import chosen
+from coim.tables import DESIGN_PREFIX, OF_RUN, read_cells, read_columns
 from recipes.interrupt import LOCK, cannot_write
 from recipes.settings import Settings, changes, plain, read_config, saved_settings
 from recipes.writing import ASIDE, shortest, telling_full_disk, write_whole
 
-DESIGN_PREFIX = "xi_"  # of the columns that hold a design
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
 
 
@@ -164,9 +164,9 @@ class Results:
 
     def table(self) -> str:
         """The designs and their best returns, for a terminal."""
-        with self._designs.path.open(newline="") as file:
-            columns, *rows = csv.reader(file)
-        lines = [[entry_of_column(name) or name for name in columns], *(format_row(row) for row in rows)]
+        path = self._designs.path
+        rows = [format_row([*row.values()]) for row in read_cells(path, OF_RUN[path.name])]
+        lines = [[entry_of_column(name) or name for name in read_columns(path)], *rows]
         widths = [max(map(len, cells)) for cells in zip(*lines)]
         return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines)
 
@@ -226,10 +226,9 @@ class Table:
         if keep is None:
             write_whole(path, ",".join(columns) + "\n")
             return
-        with path.open(newline="") as file:
-            lines = file.read().splitlines()
-        if not lines or not same_columns(lines[0].split(","), columns):
+        if not same_columns(read_columns(path), columns):
             raise ValueError(f"{path} has other columns than {columns}; go on with the version in config.json")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()  # unread: those that are dropped may be torn
         if len(lines) <= keep:
             raise ValueError(f"{path} has {len(lines) - 1} rows, the checkpoint was made after {keep}; put them back")
         write_whole(path, "\n".join(lines[: 1 + keep]) + "\n")

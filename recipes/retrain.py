@@ -27,10 +27,11 @@ from pathlib import Path
 
 import tyro
 
+from coim.tables import read_cells
 from recipes.commands import plain_sac
 from recipes.interrupt import locked, on_command_line, stopping_at_once
 from recipes.machine import available_cores
-from recipes.plots.runs import Place, Run, Runs, read_runs
+from recipes.plots.runs import CHOSEN, Place, Run, Runs, read_runs
 from recipes.reporting.records import Row
 from recipes.settings import saved_settings
 from recipes.studies.cluster import ray_running, without_words_of_ray
@@ -144,10 +145,7 @@ def episodes_in_words(cells: Sequence[Retraining]) -> str:
 
 def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
     """Lines of ``designs.csv``: those that stand there, and those of arms that are asked for and have none there."""
-    lines: list[Line] = []
-    if path.is_file():
-        with path.open(newline="") as file:
-            lines = list(csv.DictReader(file))
+    lines: list[Line] = read_cells(path, CHOSEN)
     for arm in asked.arms:
         if arm not in runs.arms:
             raise ValueError(f"{arm!r} is no arm of {asked.study}; name some of its own: --arms {' '.join(runs.arms)}")

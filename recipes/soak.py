@@ -7,7 +7,6 @@ buffers, and says how many of the fifty were identical to the last bit.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import multiprocessing
 import os
@@ -23,6 +22,7 @@ import torch
 import tyro
 
 from coim import HopperMorph
+from coim.tables import OF_RUN, read_cells
 from recipes.experiment import main as main_of_recipe
 from recipes.experiment import run
 from recipes.interrupt import on_command_line
@@ -166,8 +166,7 @@ def differences(one: Path, other: Path) -> list[str]:
 
 def rows_without_seconds(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file but for what the clock says."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_cells(path, OF_RUN[path.name])
     return [{key: value for key, value in row.items() if not key.startswith("seconds")} for row in rows]
 
 

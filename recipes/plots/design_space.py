@@ -18,9 +18,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
-from recipes.plots.measured import FOLDER, Kind, Row, folders_with, name_of, read
+from coim.tables import read_cells
+from recipes.plots.measured import FOLDER, Kind, Row, folders_with, name_of
 from recipes.plots.plot import Plot, missing
-from recipes.probing.design_space import FILE
+from recipes.probing.design_space import FILE, LAYOUT
 from recipes.probing.truth import IN_THE_FLOOR
 from recipes.reporting.curves import new_figure
 from recipes.reporting.palette import CIRCLE, put_legend
@@ -37,7 +38,7 @@ def plots(study: Path) -> Iterator[Plot]:
         line = f"python -m recipes.model_error ENVIRONMENT --out {study / FOLDER}"
         yield missing(STEM, f"No model was looked into at the end of its run: {line}")
     for kind, (folder, *others) in found.items():
-        name, rows = name_of(STEM, kind, found), read(folder / FILE)
+        name, rows = name_of(STEM, kind, found), read_cells(folder / FILE, LAYOUT)
         caption = describe(kind, rows) + " " + told_of(folder, others, study)
         yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption)
 

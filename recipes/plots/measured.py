@@ -5,7 +5,6 @@ Shapes: R runs, X training steps.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,12 +55,6 @@ def name_of(stem: str, kind: Kind, kinds: Iterable[Kind]) -> str:
     every = zip(*(other[1:] for other in kinds))
     parts = [part for part, values, usual in zip(kind[1:], every, USUAL) if {*values} != {usual}]
     return "_".join([stem, kind.environment, *parts])
-
-
-def read(path: Path) -> list[Row]:
-    """Rows of a CSV file."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def differences(folders: Sequence[Path]) -> list[str]:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from coim.tables import read_cells
 from recipes.plots.intervals import RESAMPLES
 from recipes.plots.measured import (
     FOLDER,
@@ -26,11 +27,10 @@ from recipes.plots.measured import (
     folders_with,
     late_share,
     name_of,
-    read,
     with_shares,
 )
 from recipes.plots.plot import Plot, missing
-from recipes.probing.probed import FILE
+from recipes.probing.probed import FILE, LAYOUT
 from recipes.reporting.curves import STEPS, new_figure
 from recipes.reporting.palette import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, put_legend
 from recipes.settings import read_config
@@ -74,7 +74,7 @@ def plots(study: Path) -> Iterator[Plot]:
 def rows_of(folder: Path, study: Path) -> list[dict[str, object]]:
     """What was measured in a folder, with its name and its seed."""
     seed = read_config(folder)["settings"].get("seed", 0)
-    return with_shares(read(folder / FILE), folder.relative_to(study).as_posix(), seed)
+    return with_shares(read_cells(folder / FILE, LAYOUT), folder.relative_to(study).as_posix(), seed)
 
 
 def drawn(rows: Rows) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,11 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from coim.tables import read_cells
 from recipes.plots import arms as styles
 from recipes.plots import retrained_pairs
 from recipes.plots.plot import Plot, missing
 from recipes.plots.retrained_pairs import Cells, by_place, sizes
-from recipes.plots.runs import Run, Runs, read_runs, runs_of_folder
+from recipes.plots.runs import CHOSEN, Run, Runs, read_runs, runs_of_folder
 from recipes.reporting.records import number
 
 NAME = "figure_2_retrained"
@@ -28,8 +28,7 @@ def plots(study: Path) -> Iterator[Plot]:
     if not path.is_file():
         yield from nothing(f"No design was retrained: {command}.")
         return
-    with path.open(newline="") as file:
-        listed = list(csv.DictReader(file))
+    listed = read_cells(path, CHOSEN)
     rows, lost = results(path.parent, listed)
     if not rows:
         diverged = f"; {lost} diverged before their first return" if lost else ""

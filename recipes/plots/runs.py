@@ -12,12 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
+from coim.tables import Layout
 from recipes.plots.arms import in_order
 from recipes.reporting.records import Record, Row, number, read_record, read_rows
 from recipes.studies.definition import from_json
 from recipes.studies.ledger import read_ledger
 
 Place = tuple[str, str]  # environment and task
+
+CHOSEN = Layout(  # what `recipes.retrain` has chosen to train from scratch: retrained/designs.csv
+    needed=("folder", "cell", "environment", "task", "arm", "seed", "run", "design", "xi", "found_return"),
+    words=("folder", "cell", "environment", "task", "arm", "xi"),
+    counts=("seed", "run", "design"),
+    grows=False,
+)
 
 
 @dataclass(frozen=True)

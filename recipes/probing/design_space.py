@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coim.tables import Layout
 from recipes.probing.errors import Model
 from recipes.probing.truth import PlacedSimulator
 from recipes.results import design_columns
@@ -22,6 +23,7 @@ from recipes.results import design_columns
 SIDE = 41  # points along each of the two directions
 AREA = 0.05  # of the square that two entries of a design span: of less, a picture shows next to nothing
 FILE = "design_space.csv"
+LAYOUT = Layout(needed=("state", "point", "pc_1", "pc_2", "depth"), words=("point",), counts=("state",), grows=False)
 
 
 def principal_directions(designs: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,12 +29,16 @@ from coim import (
 )
 from coim.coadaptation import UPDATES_PER_SAMPLE
 from coim.randomness import restore_generator
+from coim.tables import Layout
 from recipes.probing.errors import change_variance, mean_squares, persistence_error, prediction_error
 from recipes.probing.probes import Probes, joined
 from recipes.results import Table
 
 COLUMNS = ["run", "design", "episode", "env_steps", "probe", "predict", "mse", "normalised", "rows", "impossible"]
 FILE = "model_error.csv"
+LAYOUT = Layout(
+    needed=tuple(COLUMNS), words=("probe", "predict"), counts=("run", "design", "episode", "env_steps", "rows")
+)
 
 
 class ProbedCoAdaptation:

@@ -5,7 +5,6 @@ Shapes: K runs, X points of a curve.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Sequence
@@ -16,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from coim.envs import BODIES
-from recipes.results import DESIGN_PREFIX, entry_of_column
+from coim.tables import DESIGN_PREFIX, OF_RUN, read_columns, read_table
+from recipes.results import entry_of_column
 
 Row = dict[str, Any]
-WORDS = ("kind", "diverged")  # cells that are not numbers
-COUNTS = ("run", "design", "episode", "env_steps")
 
 
 @dataclass(frozen=True)
@@ -151,21 +149,19 @@ def read_record(folder: Path, name: str) -> Record:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a CSV file with numbers as numbers, the design as one tuple ``xi`` and NaN in empty cells.
+    """Rows of a CSV file of a run, the design as one tuple ``xi`` and NaN in empty cells.
 
     A last line that is still being written is left out, and a file that is not there has no rows.
+
+    Raises:
+        ValueError: if somebody has changed it so that it cannot be read; see `coim.tables.read_table`.
     """
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        whole = [line for line in file if line.endswith("\n")]
-    return [_typed(row) for row in csv.DictReader(whole) if None not in row.values()]
+    return [_with_design(row) for row in read_table(path, OF_RUN[path.name])]
 
 
 def design_names(path: Path, environment: str) -> tuple[str, ...]:
     """Names of the entries of a design, from the columns of a table; the body's where they are counted there."""
-    with path.open(newline="") as file:
-        columns = [name for name in next(csv.reader(file)) if name.startswith(DESIGN_PREFIX)]
+    columns = [name for name in read_columns(path) if name.startswith(DESIGN_PREFIX)]
     body = BODIES.get(environment)
     if body is not None and len(columns) == body.DESIGN_SIZE:
         known = body.design_names()
@@ -174,25 +170,11 @@ def design_names(path: Path, environment: str) -> tuple[str, ...]:
     return tuple(entry_of_column(column) or name for column, name in zip(columns, known))
 
 
-def _typed(cells: dict[str, str]) -> Row:
-    design = tuple(float(cell) for key, cell in cells.items() if key.startswith(DESIGN_PREFIX))
-    row: Row = {"xi": design} if design else {}
-    for key, cell in cells.items():
-        if key in WORDS:
-            row[key] = cell
-        elif key in COUNTS:
-            row[key] = int(cell)
-        elif not key.startswith(DESIGN_PREFIX):
-            row[key] = _number(cell)
-    return row
-
-
-def _number(cell: str) -> float:
-    """NaN for a cell that holds no number."""
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+def _with_design(cells: Row) -> Row:
+    """A row with its design as one tuple."""
+    design = tuple(cell for column, cell in cells.items() if column.startswith(DESIGN_PREFIX))
+    others = {column: cell for column, cell in cells.items() if not column.startswith(DESIGN_PREFIX)}
+    return {"xi": design} | others if design else others
 
 
 def best_of_designs(episodes: Sequence[Row], finished: Sequence[Row]) -> list[Row]:

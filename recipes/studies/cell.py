@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import os
@@ -12,6 +11,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from coim.envs import BODIES
+from coim.tables import OF_RUN, read_cells
 from recipes.checkpoint import refuse_lost_checkpoints
 from recipes.experiment import run
 from recipes.interrupt import LOCK
@@ -117,8 +117,5 @@ def episodes_done(folder: Path, num_runs: int) -> int:
 
 def seconds_of(folder: Path) -> float:
     """What a run took, by its own clock: of all the processes that computed at it; 0 if its table is not there."""
-    try:
-        with (folder / "evaluations.csv").open(newline="") as file:
-            return max((float(row["seconds"]) for row in csv.DictReader(file)), default=0.0)
-    except OSError:  # a shared file system may show it later
-        return 0.0
+    path = folder / "evaluations.csv"  # a shared file system may show it later
+    return max((float(row["seconds"] or 0.0) for row in read_cells(path, OF_RUN[path.name])), default=0.0)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from coim.tables import Layout, read_table
 from recipes.studies.definition import Cell
 from recipes.writing import write_whole
 
@@ -39,6 +41,12 @@ class Entry:
 
 
 COLUMNS = [field.name for field in dataclasses.fields(Entry)]
+LAYOUT = Layout(
+    needed=tuple(COLUMNS),
+    words=("cell", "environment", "task", "arm", "state", "message"),
+    counts=("seed", "tries"),
+    grows=False,
+)
 
 
 class Ledger:
@@ -104,20 +112,14 @@ def read_ledger(path: Path) -> list[Entry]:
     Raises:
         ValueError: if it cannot be read as one.
     """
-    if not path.is_file():
-        return []
     try:
-        with path.open(newline="") as file:
-            return [
-                Entry(
-                    **row
-                    | {"seed": int(row["seed"]), "tries": int(row["tries"])}
-                    | {"seconds": float(row["seconds"]) if row["seconds"] else None}
-                )
-                for row in csv.DictReader(file)
-            ]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path} is damaged ({error}); put it back from a copy, or delete it, and what is finished is found again "
-            "by its checkpoints"
-        ) from None
+        rows: list[dict[str, Any]] = read_table(path, LAYOUT)
+    except ValueError as error:
+        raise ValueError(f"{error}; or delete it, and what is finished is found again by its checkpoints") from None
+    return [
+        Entry(
+            **{name: row[name] for name in COLUMNS}
+            | {"seconds": None if math.isnan(row["seconds"]) else row["seconds"]}
+        )
+        for row in rows
+    ]

@@ -42,7 +42,8 @@ def study(tmp_path: Path) -> Path:
         ledger.note(cell.name, "running" if cell.name == UNDER_WAY else "finished", tries=1, seconds=9.0)
     write_cell(folder, "hopper-forward-none-0-run0-design3", [1.5], part="retrained/cells", num_designs=1)
     line = {"folder": "hopper-forward-none-0-run0-design3", "environment": "hopper", "task": "forward", "arm": "none"}
-    line |= {"seed": "0", "run": "0", "design": "3", "xi": "1 1", "found_return": "3", "over": "2", "planned": "2"}
+    line |= {"cell": "hopper-forward-none-0", "seed": "0", "run": "0", "design": "3", "xi": "1 1", "found_return": "3"}
+    line |= {"over": "2", "planned": "2"}
     write_table(folder / "retrained" / "designs.csv", list(line), [list(line.values())])
     measured = write_cell(folder, "model_error", [1, 2, 3, 4], part=".")
     config = json.loads((measured / "config.json").read_text())

@@ -338,6 +338,26 @@ def test_long_runs_are_drawn_as_means_of_neighbouring_episodes(runs: Path, monke
     assert "A point is the mean of 3 episodes." in check(write_report([runs / "one"], out=runs / "long.html")).words
 
 
+@pytest.mark.parametrize("name", ["evaluations.csv", "designs.csv", "metrics.csv"])
+def test_a_page_is_not_made_of_half_a_table(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, name: str
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(runs / "fleet", folder, ignore=shutil.ignore_patterns("report.html", "checkpoint"))
+    text = (folder / name).read_text()
+    (folder / name).write_text("\ufeff" + text)
+    main([str(folder)])
+    page = (folder / "report.html").read_text()
+    head, first, second, *others = text.splitlines(keepends=True)
+    torn = {2: [head, first[:9] + "\n", second, *others], 3: [head, first, second.replace(",", ",x,", 1), *others]}
+    for line, lines in torn.items():
+        (folder / name).write_text("".join(lines))
+        with pytest.raises(SystemExit, match=rf"{name}, line {line}: found .*, expected") as stop:
+            main([str(folder)])
+        assert "\n" not in str(stop.value)
+    assert (folder / "report.html").read_text() == page
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")
 def test_a_browser_draws_the_page(runs: Path, tmp_path: Path) -> None:
     page = runs / "fleet" / "report.html"

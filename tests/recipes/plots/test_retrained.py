@@ -29,9 +29,10 @@ def write_retrained(
     lines: list[dict[str, object]] = []
     for arm, chosen in arms.items():
         for index, (seed, xi, best) in enumerate(chosen):
-            name = f"{environment}-forward-{arm}-{seed}-run0-design{index}"
-            line = {"folder": name, "environment": environment, "task": "forward", "arm": arm, "seed": seed, "run": 0}
-            lines.append(line | {"design": index, "xi": xi, "found_return": 30} | noted)
+            cell = f"{environment}-forward-{arm}-{seed}"
+            name = f"{cell}-run0-design{index}"
+            line = {"folder": name, "cell": cell, "environment": environment, "task": "forward", "arm": arm}
+            lines.append(line | {"seed": seed, "run": 0} | {"design": index, "xi": xi, "found_return": 30} | noted)
             diverged = [0] if math.isnan(best) else []
             write_cell(study, name, [best], part="retrained/cells", diverged=diverged, num_designs=1, first_episodes=9)
     list_designs(study, lines)
