@@ -77,7 +77,7 @@ class Options:
 
     rehearse: bool = False
     """Take the whole way on the CPU at tiny sizes, without a GPU; its numbers say nothing."""
-    minutes: float = 8.0
+    minutes: float = 7.0
     """What has not begun by then is left out, and told."""
     out: Path = Path("runs/gpu.json")
     """Where the JSON goes."""
@@ -221,15 +221,26 @@ def update(effort: Effort, runs: int, device: torch.device) -> Result:
         options = {"num_runs": num_runs, "device": where, "compile": False} | options
         return synchronised(our_updates(buffer, effort, effort.updates, **options), where)
 
+    def candidate(**options: Any) -> Callable[[], None]:
+        made = action(runs, device, **options)
+        made()  # whatever cannot be compiled or captured fails here
+        return made
+
+    wanted: dict[str, dict[str, Any]] = {
+        "float32": {},
+        "bfloat16": {"precision": "bfloat16"},
+        "float32, compiled": {"compile": True},
+    }
+    candidates, failed = {}, {}
+    for name, options in wanted.items():
+        try:
+            candidates[name] = candidate(**options)
+        except Exception as error:  # the others are measured
+            failed[name] = f"{type(error).__name__}: {error}"
     alone = action(1, torch.device("cpu") if runs == 1 else device)
     against = "one run on one thread of the CPU" if runs == 1 else "one run on this device"
-    candidates = {
-        "float32": action(runs, device),
-        "bfloat16": action(runs, device, precision="bfloat16"),
-        "float32, compiled": action(runs, device, compile=True),
-    }
     times = interleaved({"alone": alone, **candidates}, effort.repeats)
-    return rows(
+    found = rows(
         Figure(
             row=f"update, K = {runs}, {name}",
             against=against,
@@ -239,6 +250,7 @@ def update(effort: Effort, runs: int, device: torch.device) -> Result:
         )
         for name in candidates
     )
+    return found | ({"holds": False, "failed": failed} if failed else {})
 
 
 def iteration(effort: Effort, runs: int, device: torch.device) -> Result:

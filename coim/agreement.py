@@ -12,8 +12,9 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torchrl.data import Bounded
 
-from coim.designs import DesignGenerator
+from coim.designs import DesignGenerator, DesignSearch
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
@@ -41,7 +42,13 @@ def check_precision(precision: str) -> None:
 
 
 def check_bodies(env: MorphEnv, evaluation_env: MorphEnv) -> None:
-    """Refuse evaluation bodies that are those of training, or are paid for something else."""
+    """Refuse bodies behind transforms, and evaluation bodies that are those of training or are paid otherwise."""
+    for name, bodies in (("env", env), ("evaluation_env", evaluation_env)):
+        if not isinstance(bodies, MorphEnv):
+            raise TypeError(
+                f"{name} is a {type(bodies).__name__}, and episodes step the bodies themselves; pass a MorphEnv, which "
+                "of a TransformedEnv is its base_env"
+            )
     if env is evaluation_env:
         raise ValueError(
             "env and evaluation_env are one environment, and evaluating would change training; make two, with seeds of "
@@ -115,6 +122,11 @@ def check_dream(
         raise ValueError("imagining needs both a dream and a generator; give both, or neither for the baseline")
     if dream is None or generator is None:
         return
+    if not isinstance(dream, WorldModelEnv):
+        raise TypeError(
+            f"the dream is a {type(dream).__name__}, and imagination asks its model itself; pass a WorldModelEnv, which "
+            "of a TransformedEnv is its base_env"
+        )
     model = dream.ensemble
     if isinstance(model, GaussianEnsemble):
         if dynamics is not None and model is not dynamics.ensemble:
@@ -169,6 +181,21 @@ def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: T
         raise ValueError(
             f"the generator makes {found[outside][0].tolist()} of {tried[outside][0].tolist()}, which leaves "
             f"[{low.tolist()}, {high.tolist()}]; let it end with design_spec.project()"
+        )
+
+
+def check_search(env: MorphEnv, search: DesignSearch) -> None:
+    """Refuse a search among designs that these bodies cannot have; one that does not say where it looks is believed."""
+    spec: Bounded | None = getattr(search, "spec", None)
+    if spec is None:
+        return
+    own, theirs = env.design_spec.space, spec.space
+    alike = spec.shape == env.design_spec.shape and theirs.low.device == own.low.device
+    if not alike or (theirs.low < own.low).any() or (theirs.high > own.high).any():
+        raise ValueError(
+            f"the search looks among designs of [{theirs.low.tolist()}, {theirs.high.tolist()}] on "
+            f"{theirs.low.device}, the bodies have those of [{own.low.tolist()}, {own.high.tolist()}] on "
+            f"{own.low.device}; make it with env.design_spec"
         )
 
 

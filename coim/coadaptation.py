@@ -30,6 +30,7 @@ from coim.agreement import (
     check_first_designs,
     check_learners,
     check_precision,
+    check_search,
 )
 from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
@@ -100,8 +101,9 @@ class CoAdaptation:
         ValueError: if a count is below its least value, a share outside [0, 1] or of less than a row, ``bodies`` or
             ``precision`` is unknown, or the parts do not agree (see `coim.agreement`): two environments or learners
             are one, evaluation is of another body or task, networks lack the runs of the bodies, the dream steps
-            another ensemble than the one that learns or pays other rewards, G leaves the bounds, first designs have
-            the wrong shape, dtype or device, or learners that are not on the CPU shall go side by side.
+            another ensemble than the one that learns or pays other rewards, G or the search leaves the bounds, first
+            designs have the wrong shape, dtype or device, or learners that are not on the CPU shall go side by side.
+        TypeError: if an environment or the dream is behind transforms.
 
     Note:
         Whoever stops at an event may come back to it: iterating again goes on with what comes next, and so does another
@@ -154,6 +156,7 @@ class CoAdaptation:
         check_precision(precision)
         check_bodies(env, evaluation_env)
         check_first_designs(env, first_designs)
+        check_search(env, search)
         self.device = check_learners(env, population, individual, dynamics, side_by_side=side_by_side)
         check_dream(env, dynamics, dream, generator, first_designs)
         self.env, self.evaluation_env = env, evaluation_env

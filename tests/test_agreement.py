@@ -10,6 +10,8 @@ import pytest
 import torch
 from test_coadaptation import STEPS
 from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import DoubleToFloat, TransformedEnv
 
 from coim import (
     Buffers,
@@ -20,6 +22,7 @@ from coim import (
     GradientSearch,
     HopperMorph,
     KnownDesigns,
+    ParticleSwarm,
     SACLearner,
     WalkerMorph,
     WorldModelEnv,
@@ -143,6 +146,14 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
     "a dream of another body": (walking_dream, r"the dream has sizes \{'observation': 18"),
     "G leaves the bounds": (lambda: dreaming(generator=beyond), r"the generator makes \[.*\] of \[.*\], which leaves"),
     "G of another shape": (lambda: dreaming(generator=flat), r"makes designs \[96, 4\] of designs \[48, 2, 4\]"),
+    "a search for another body": (
+        lambda: {"search": GradientSearch(WalkerMorph(seed=0).design_spec, seed=0)},
+        r"the search looks among designs of \[.*\] on cpu, the bodies have .*; make it with env\.design_spec",
+    ),
+    "a search in wider bounds": (
+        lambda: {"search": ParticleSwarm(Bounded(0.5, 3.0, shape=(4,)), seed=0)},
+        r"the search looks among designs of .*3\.0, 3\.0\]",
+    ),
     "no first design": (lambda: {"first_designs": torch.ones(0, 4)}, "with at least one row"),
     "a first design of NaN": (lambda: {"first_designs": torch.full((1, 4), torch.nan)}, "a first design of .* leaves"),
     "double first designs": (
@@ -160,6 +171,22 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
 def test_parts_that_do_not_fit_are_refused(parts: Callable[[], dict[str, Any]], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         algorithm(**parts())
+
+
+def test_what_is_behind_transforms_is_refused() -> None:
+    def behind(env: Any) -> TransformedEnv:
+        return TransformedEnv(env, DoubleToFloat(in_keys=["observation"]))
+
+    with pytest.raises(TypeError, match=r"evaluation_env is a TransformedEnv, .* pass a MorphEnv"):
+        algorithm(evaluation_env=behind(unlike()))
+    parts = dreaming()
+    with pytest.raises(TypeError, match=r"the dream is a TransformedEnv, .* pass a WorldModelEnv"):
+        algorithm(**parts | {"dream": behind(parts["dream"])})
+
+
+def test_a_search_within_narrower_bounds_and_one_that_says_nothing_are_taken() -> None:
+    algorithm(search=GradientSearch(Bounded(0.9, 1.1, shape=(4,)), seed=0))
+    algorithm(search=SimpleNamespace(maximise=lambda fitness: (torch.ones(4), 0.0)))
 
 
 def test_trying_g_moves_no_generator_that_others_draw_from() -> None:

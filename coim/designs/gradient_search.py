@@ -57,6 +57,7 @@ class GradientSearch:
             raise ValueError(f"{num_starts} starts x {num_steps} steps: both must be at least 1")
         if not lr > 0:
             raise ValueError(f"lr is {lr}, it must be positive: it is the first step as a share of the design's range")
+        self.spec = spec
         self._low, self._high = bounds_of(spec)
         self.num_starts, self.num_steps, self.lr = num_starts, num_steps, lr
         self._rng = torch.Generator()

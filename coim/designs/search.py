@@ -19,6 +19,8 @@ Fitness = Callable[[Tensor], Tensor]
 class DesignSearch(Protocol):
     """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`.
 
+    One that has its bounds as ``spec`` is refused at once where they do not fit the bodies.
+
     One whose random numbers go on from call to call also needs ``state_dict`` and ``load_state_dict``: without them a
     run that is resumed draws others than the run that was never stopped.
     """

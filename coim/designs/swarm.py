@@ -96,6 +96,7 @@ class ParticleSwarm:
             raise ValueError(f"{num_particles} particles x {num_iterations} iterations: both must be at least 1")
         if bounds not in ("nearest", "periodic"):
             raise ValueError(f"bounds={bounds!r} is an unknown option; take 'nearest' or 'periodic'")
+        self.spec = spec
         self._low, self._high = bounds_of(spec)
         self.bounds = bounds
         self.num_particles = num_particles

@@ -28,6 +28,17 @@ def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatc
     assert all(figure["ratio"]["median"] > 0 for name in ROWS for figure in found["parts"][name]["figures"])
 
 
+def test_what_cannot_be_compiled_is_told_beside_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_compiler(find: object, device: object) -> None:
+        raise RuntimeError("no compiler")
+
+    monkeypatch.setattr("coim.learner.compiled", no_compiler)
+    found = gpu.update(gpu.TINY, 2, torch.device("cpu"))
+    assert found["failed"] == {"float32, compiled": "RuntimeError: no compiler"}
+    assert not found["holds"]
+    assert [figure["row"] for figure in found["figures"]] == ["update, K = 2, float32", "update, K = 2, bfloat16"]
+
+
 def test_marked_tests_are_counted() -> None:
     counted = gpu.marked_tests(120)
     assert counted["holds"], counted
