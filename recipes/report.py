@@ -33,7 +33,7 @@ class Report:
     folders: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders of one environment."""
     out: Path | None = None
-    """The page, or a folder for it; by default report.html in the run's folder; of several, runs/comparison-DATE.html."""
+    """The page, or a folder for it; by default report.html in the run's folder, of several runs/comparison-DATE."""
     body: str | None = None
     """Class of the body as module:Class, if it is not one of ours: else its bodies are not drawn."""
 
