@@ -5,7 +5,7 @@ Shapes: ``*B`` batch of the environment, S observation, D design, A action.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from typing import Any
 
 import torch
@@ -27,6 +27,29 @@ class DesignedEnv(EnvBase):
             return super().reset(tensordict, **kwargs)
         self._assert_tensordict_shape(tensordict)
         return tensordict.update(super().reset(**kwargs))
+
+
+def idle_rows(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor | None:
+    """Rows that TorchRL asks to leave as they are, by a ``_step`` in the input of a step, as ``ConditionalSkip`` does.
+
+    Returns:
+        ``[*B]`` bool; None where all rows are stepped.
+    """
+    stepped = tensordict.get("_step", None)
+    return None if stepped is None else ~stepped.reshape(batch_size)
+
+
+def leave_idle(after: MutableMapping[str, Tensor], before: TensorDictBase, idle: Tensor) -> None:
+    """Answer for rows that were not stepped, in place: no reward, and the flags that they had.
+
+    Args:
+        after: answer of a step, ``[*B]``.
+        before: input of the step, ``[*B]``.
+        idle: ``[*B]`` bool.
+    """
+    after["reward"] = torch.where(idle.unsqueeze(-1), 0, after["reward"])
+    for key in ("done", "terminated", "truncated"):
+        after[key][idle] = before[key][idle] if key in before else False
 
 
 def check_step(given: Tensor | None, body: Tensor) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import functools
 import math
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
@@ -196,6 +198,26 @@ class Fleet:
         qvel[:] = state[:, num_positions:]
         self._step_count.zero_()
         self._observation = self._see()
+
+    @contextmanager
+    def holding(self, rows: Tensor | None) -> Iterator[None]:
+        """Let some rows stand still while the fleet moves.
+
+        Args:
+            rows: ``[K]`` bool, on the CPU; None holds none.
+        """
+        if rows is None:
+            yield
+            return
+        before = self.get_simulation_state()[rows]
+        yield
+        self.simulations.state[rows.numpy()] = before["simulation"].numpy()
+        for key, value in (
+            ("observation", self._observation),
+            ("step_count", self._step_count),
+            ("num_broken", self.num_broken),
+        ):
+            value[rows] = before[key]
 
     def get_simulation_state(self) -> TensorDict:
         """All that the coming steps and resets depend on, ``[K]``: bodies, simulations, generators, counters.

@@ -23,7 +23,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
-from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step
+from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step, idle_rows, leave_idle
 from coim.envs.fleet import Fleet
 from coim.envs.simulation import PITCH
 from coim.envs.task import Task, speed_along
@@ -224,9 +224,11 @@ class MorphEnv(Fleet, DesignedEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         given = tensordict
         if not self._on_host:  # one transfer there, and one back
-            given = tensordict.select("action", "design", strict=False).to("cpu")
+            given = tensordict.select("action", "design", "_step", *DONE_KEYS, strict=False).to("cpu")
         check_step(given.get("design", None), self._design)
-        observation, reward, terminated = self.advance(given.get("action"))
+        idle = idle_rows(given, self.batch_size)
+        with self.holding(idle):
+            observation, reward, terminated = self.advance(given.get("action"))
         truncated = self._step_count >= self.episode_steps
         values = {
             "observation": observation,
@@ -236,6 +238,9 @@ class MorphEnv(Fleet, DesignedEnv):
             "truncated": truncated,
             "done": terminated | truncated,
         }
+        if idle is not None:
+            observation[idle] = self._observation[idle]
+            leave_idle(values, given, idle)
         return self._answer(values)
 
     def _answer(self, values: dict[str, Tensor]) -> TensorDict:

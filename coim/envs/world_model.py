@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step
+from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step, idle_rows, leave_idle
 from coim.randomness import restore_generator
 
 STATE_KEYS = ("observation", "design")
@@ -132,9 +132,15 @@ class WorldModelEnv(DesignedEnv):
         if seen is not None and not seen.requires_grad:  # the caller has cut the gradient: no graph grows in here
             observation = observation.detach()
         next_observation, reward = self.advance(observation, tensordict["action"], design)
+        idle = idle_rows(tensordict, self.batch_size)
+        if idle is not None:
+            next_observation = torch.where(idle.unsqueeze(-1), observation, next_observation)
         after = TensorDict({"observation": next_observation, "design": design}, self.batch_size, device=self.device)
         self._state = after.clone()  # ours; what is handed out may be written to
-        return self.full_done_spec.zero().update(after).set("reward", reward)
+        answer = self.full_done_spec.zero().update(after).set("reward", reward)
+        if idle is not None:
+            leave_idle(answer, tensordict, idle)
+        return answer
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         check_reset(tensordict, STATE_KEYS, self.observation_spec["design"].shape)

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import (
     CatTensors,
     Compose,
+    ConditionalSkip,
     DoubleToFloat,
     ObservationNorm,
     RenameTransform,
@@ -125,3 +126,34 @@ def test_a_misspelt_design_is_refused_and_an_empty_reset_keeps_the_bodies() -> N
     assert env.reset(empty) is empty
     assert empty["design"].equal(torch.full((2, 4), 1.5))
     assert empty["observation"].shape == (2, 11)
+
+
+def test_rows_that_are_not_stepped_stand_still_and_the_others_do_not_notice() -> None:
+    env, whole = (HopperMorph(num_runs=2, seed=0, episode_steps=4) for _ in range(2))
+    td, expected = env.reset(), whole.reset()
+    before = td["observation"].clone()
+    for action in torch.rand(4, 2, 3, generator=torch.Generator().manual_seed(0)):
+        asked = td.clone().update({"action": action, "_step": torch.tensor([True, False])})
+        td = env.step(asked)["next"]
+        expected = whole.step(expected.set("action", action))["next"]
+        assert td["observation"][0].equal(expected["observation"][0])
+        assert td["observation"][1].equal(before[1])
+        assert td["reward"][1] == 0
+        td, expected = td.exclude("reward"), expected.exclude("reward")
+    assert td["truncated"].flatten().tolist() == [True, False]
+    after = env.step(td.set("action", torch.zeros(2, 3)))["next", "observation"]
+    assert after[1].equal(
+        HopperMorph(num_runs=2, seed=0).rollout(1, lambda td: td.set("action", torch.zeros(2, 3)))[1][
+            "next", "observation"
+        ][0]
+    )
+
+
+def test_a_skipping_transform_skips_its_rows_only() -> None:
+    def act_on_the_first(td: TensorDict) -> torch.Tensor:
+        return torch.tensor([False, True])  # True: is skipped
+
+    env = TransformedEnv(HopperMorph(num_runs=2, seed=0), ConditionalSkip(act_on_the_first))
+    rows = env.rollout(3)
+    assert (rows["observation"][1] == rows["next", "observation"][1]).all()
+    assert (rows["observation"][0] != rows["next", "observation"][0]).any(-1).all()

@@ -426,6 +426,15 @@ def test_gradients_flow_through_a_transformed_rollout_unless_the_caller_cuts_the
             torch.testing.assert_close(gradient, torch.full((2, 1), expected))
 
 
+def test_rows_that_are_not_stepped_stay_where_they_are() -> None:
+    dream, start = make_dream(3), start_of(3)
+    td = dream.reset(start.clone()).set("action", torch.zeros(3, 1)).set("_step", torch.tensor([True, False, True]))
+    after = dream.step(td)["next"]
+    assert torch.equal(after["observation"][1], start["observation"][1])
+    assert (after["observation"][::2] != start["observation"][::2]).any(-1).all()
+    assert (after["reward"] == 0).flatten().tolist() == [False, True, False]
+
+
 # ---- copies and what is refused ----
 
 
