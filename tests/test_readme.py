@@ -29,8 +29,8 @@ TINY = Settings(
 )
 
 
-def test_there_are_six_snippets() -> None:
-    assert len(SNIPPETS) == 6
+def test_there_are_seven_snippets() -> None:
+    assert len(SNIPPETS) == 7
 
 
 @pytest.mark.parametrize("snippet", SNIPPETS, ids=lambda text: text.splitlines()[-1][:40])
