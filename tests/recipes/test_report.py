@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
-from coim import HopperMorph
+from coim import HalfCheetahMorph, HopperMorph
 from recipes import experiment
 from recipes.report import main, write_report
 from recipes.reporting.figures import describe_correlation, rank_correlation
@@ -269,6 +269,13 @@ def test_entries_of_a_design_have_the_names_of_the_columns_or_of_the_body(
     page = check(write_report([folder]))
     assert all(name in page.words for name in names)
     assert any(f"Scale factors over designs: {', '.join(names)}." in image["alt"] for image in page.images)
+
+
+def test_the_tables_in_docs_that_count_the_entries_are_read_with_the_names_of_the_body() -> None:
+    kept = Path(__file__).parents[2] / "docs" / "results" / "preview" / "cells" / "half_cheetah-forward-none-0"
+    record = read_record(kept, kept.name)
+    assert record.design_names == HalfCheetahMorph.design_names()
+    assert len(record.designs[0]["xi"]) == 6
 
 
 def test_names_are_words_and_neither_tags_nor_formulas(runs: Path, tmp_path: Path) -> None:

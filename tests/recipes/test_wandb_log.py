@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from interrupted_runs import cut, resume, run
 
+from coim import EpisodeDone
 from recipes.results import Results
+from recipes.wandb_log import scalars
 
 SMALL = {"num_designs": 2, "episodes": 1}
 
@@ -24,6 +27,23 @@ def children() -> list[int]:
         ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=True
     )
     return [int(line.split()[0]) for line in listed.stdout.splitlines() if "wandb-core" in line]
+
+
+def test_series_have_the_names_of_the_columns() -> None:
+    event = EpisodeDone(
+        index=0,
+        kind="first",
+        episode=0,
+        design=torch.tensor([[1.0, 1.5], [0.5, 2.0]]),
+        training_return=torch.zeros(2),
+        evaluation_return=torch.zeros(2),
+        env_steps=6,
+        imagined=0,
+        metrics={},
+        seconds={},
+    )
+    found = scalars(event, ["xi_torso", "xi_foot"])
+    assert (found["run 0/xi_foot"], found["run 1/xi_torso"]) == (1.5, 0.5)
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
