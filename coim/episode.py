@@ -14,16 +14,19 @@ from itertools import chain
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import ExplorationType, set_exploration_type
 
 from coim.envs.morph import MorphEnv
 from coim.models.policy import Policy
+from coim.randomness import drawing_from
 
 
 @torch.no_grad()
 def run_episode(
     env: MorphEnv,
-    policy: Policy | None,
+    policy: TensorDictModuleBase | None,
     *,
     design: Tensor | None = None,
     deterministic: bool = False,
@@ -35,7 +38,8 @@ def run_episode(
 
     Args:
         env: K bodies in lock-step, without transforms: rows hold what the bodies do, not what a transform makes of it.
-        policy: who acts; None draws every action uniformly.
+        policy: who acts; None draws every action uniformly. A `Policy` that is as it was made acts without TensorDicts,
+            many times faster than any other module that reads ``observation`` and ``design`` and writes ``action``.
         design: ``[K, D]`` bodies to build before the episode; None keeps the present ones.
         deterministic: act with the mode of the policy instead of a sample.
         rng: where the actions' noise comes from; None uses torch's default generator of the CPU. Drawn on the CPU, an
@@ -68,12 +72,15 @@ def run_episode(
     following = torch.empty_like(observations)
     actions = observation.new_empty(steps, *shape)
     broken = torch.zeros(steps, *env.batch_size, 1, dtype=torch.bool, device="cpu")
-    network = None if policy is None else _on_cpu(policy).network.for_design(design)
+    actor = None if policy is None else _on_cpu(policy)
+    network = actor.network.for_design(design) if isinstance(actor, Policy) and actor.is_unaltered() else None
     rows = zip(observations.unbind(), actions.unbind(), following.unbind(), broken.unbind())
     for t, (observed, acted, followed, ended) in enumerate(rows):
         observed.copy_(observation)
-        if network is None:
+        if actor is None:
             acted.copy_(noise[t])
+        elif network is None:
+            acted.copy_(_called(actor, observation, design, deterministic, rng))
         else:
             loc, scale = network(observation)
             torch.tanh(loc if deterministic else torch.addcmul(loc, scale, noise[t]), out=acted)
@@ -109,14 +116,24 @@ def run_episode(
     return episode if env.device is None else episode.to(env.device)
 
 
-def _on_cpu(policy: Policy) -> Policy:
+def _called(
+    policy: TensorDictModuleBase, observation: Tensor, design: Tensor, deterministic: bool, rng: torch.Generator | None
+) -> Tensor:
+    """The action of any policy, by calling it, ``[K, A]``."""
+    seen = TensorDict({"observation": observation, "design": design}, observation.shape[:1])
+    kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    with drawing_from(rng, observation.device), set_exploration_type(kind):
+        return policy(seen)["action"]
+
+
+def _on_cpu(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """The policy, or a copy of one that lives elsewhere, whose every action would have to be waited for."""
     tensors = chain(policy.parameters(), policy.buffers())
     return policy if all(tensor.device.type == "cpu" for tensor in tensors) else deepcopy(policy).cpu()
 
 
 def _noise(
-    steps: int, shape: torch.Size, policy: Policy | None, deterministic: bool, rng: torch.Generator | None
+    steps: int, shape: torch.Size, policy: TensorDictModuleBase | None, deterministic: bool, rng: torch.Generator | None
 ) -> Tensor:
     """What randomness the whole episode needs: uniform actions, standard normal noise, or none, ``[T, K, A]``."""
     if policy is not None and deterministic:

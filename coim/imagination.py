@@ -8,9 +8,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -18,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coim.designs import DesignGenerator
 from coim.envs.world_model import WorldModelEnv
+from coim.randomness import drawing_from
 
 # On a CPU, larger products no longer fit the cache of a core and gain nothing; elsewhere a chunk shall fit the memory.
 CHUNK_ROWS = {"cpu": 3_000}
@@ -72,7 +70,7 @@ def imagine(
     device, rows_per_state = states["observation"].device, states.batch_size[1:].numel()
     size = CHUNK_ROWS.get(device.type, MANY_ROWS)
     chunks = states.select("observation", "design").split(max(1, size // rows_per_state))
-    with _drawing_from(rng), set_exploration_type(ExplorationType.RANDOM):
+    with drawing_from(rng, device), set_exploration_type(ExplorationType.RANDOM):
         return torch.cat([_imagine_chunk(dream, chunk, policy, generator, rng) for chunk in chunks])
 
 
@@ -99,24 +97,3 @@ def _imagine_chunk(
     after |= {"terminated": never, "truncated": never.clone(), "done": never.clone()}
     row = {"observation": observation, "design": design, "action": action, "next": after}
     return TensorDict(row, states.batch_size, device=states.device)
-
-
-@contextmanager
-def _drawing_from(rng: torch.Generator | None) -> Iterator[None]:
-    """Let modules that can only draw from torch's global generator draw reproducibly, and leave it as it was.
-
-    TorchRL's distributions take no generator.
-    """
-    if rng is None:
-        yield
-        return
-    shared = (
-        torch.default_generator if rng.device.type == "cpu" else torch.cuda.default_generators[rng.device.index or 0]
-    )
-    before = shared.get_state()
-    seed = torch.randint(2**62, (), generator=rng, device=rng.device)
-    shared.manual_seed(int(seed))
-    try:
-        yield
-    finally:
-        shared.set_state(before)

@@ -1,4 +1,4 @@
-"""States of random number generators, given back to generators of this or another kind of device.
+"""Random number generators: their states on other kinds of devices, and modules that only draw from torch's global one.
 
 References:
     PyTorch: `torch.Generator <https://docs.pytorch.org/docs/stable/generated/torch.Generator.html>`_.
@@ -7,6 +7,8 @@ References:
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -35,3 +37,25 @@ def restore_generator(generator: torch.Generator, state: Tensor) -> None:
     else:
         digest = hashlib.sha256(own.numpy().tobytes()).digest()
         generator.manual_seed(int.from_bytes(digest[:8], "big") >> 1)  # seeds are 63 bits and a sign
+
+
+@contextmanager
+def drawing_from(rng: torch.Generator | None, device: torch.device) -> Iterator[None]:
+    """Let modules that can only draw from torch's global generator draw reproducibly, and leave it as it was.
+
+    TorchRL's distributions take no generator.
+
+    Args:
+        rng: gives the seed; None lets them draw from the global generator.
+        device: on which they draw.
+    """
+    if rng is None:
+        yield
+        return
+    shared = torch.default_generator if device.type == "cpu" else torch.cuda.default_generators[device.index or 0]
+    before = shared.get_state()
+    shared.manual_seed(int(torch.randint(2**62, (), generator=rng, device=rng.device)))
+    try:
+        yield
+    finally:
+        shared.set_state(before)

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import SafeProbabilisticModule, TanhNormal
 
+from coim.calling import altered_part
 from coim.models.ensemble import GaussianEnsemble
 from coim.models.normaliser import RunningNormaliser
 from coim.models.policy import Policy, PolicyNetwork
@@ -77,16 +78,12 @@ def check_ensemble(ensemble: GaussianEnsemble) -> None:
 
 
 def _check_parts(network: nn.Module, kinds: tuple[type[nn.Module], ...], learner: str, loss: str) -> None:
-    known = {kind.forward for kind in kinds}
-    for name, part in network.named_modules():
-        own = type(part).forward not in known or "forward" in vars(part)
-        if own or part._forward_hooks or part._forward_pre_hooks:
-            where = f"{type(network).__name__}.{name}" if name else type(network).__name__
-            raise TypeError(
-                f"{learner} knows the gradients of the networks of coim.models alone, and {where}, a "
-                f"{type(part).__name__}, has {'a forward of its own' if own else 'hooks'}; train it with {loss} and an "
-                "optimiser"
-            )
+    altered = altered_part(network, kinds)
+    if altered is not None:
+        raise TypeError(
+            f"{learner} knows the gradients of the networks of coim.models alone, and {altered}; train it with {loss} "
+            "and an optimiser"
+        )
 
 
 def _same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:

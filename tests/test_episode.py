@@ -2,16 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import ObservationNorm, TransformedEnv
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import nn
+from torchrl.envs import ExplorationType, ObservationNorm, TransformedEnv, set_exploration_type
 
 from coim import HopperMorph, make_policy, run_episode
 from coim.buffers import ROW_KEYS
-from coim.models import Policy
+from coim.models import Policy, PolicyNetwork
+from coim.models.stacked import StackedMLP
+
+
+class Doubled(PolicyNetwork):
+    """Acts by twice the mean."""
+
+    def forward(self, observation: torch.Tensor, design: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        loc, scale = super().forward(observation, design)
+        return 2 * loc, scale
+
+
+class Negated(Policy):
+    """Does the opposite."""
+
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        tensordict = super().forward(tensordict)
+        return tensordict.set("action", -tensordict["action"])
+
+
+def other_activation(policy: Policy) -> TensorDictModuleBase:
+    policy.network.mlp = StackedMLP(15, 6, (8,), activation=nn.ELU)
+    return policy
+
+
+def other_network(policy: Policy) -> TensorDictModuleBase:
+    return Policy(Doubled(11, 4, 3, num_cells=(8,), scaling=policy.network.scaling))
+
+
+def other_layer(policy: Policy) -> TensorDictModuleBase:
+    policy.network.mlp.layers[0].register_forward_hook(lambda module, given, out: 2 * out)
+    return policy
+
+
+def other_distribution(policy: Policy) -> TensorDictModuleBase:
+    policy[-1].distribution_kwargs = {"low": -0.5, "high": 0.5}
+    return policy
+
+
+def foreign(policy: Policy) -> TensorDictModuleBase:
+    return TensorDictModule(lambda observation: observation[:, :3].sin(), in_keys=["observation"], out_keys=["action"])
+
+
+ALTERED = [other_activation, other_network, other_layer, other_distribution, foreign, lambda p: Negated(p.network)]
 
 
 def test_a_deterministic_episode_equals_a_rollout_with_the_same_policy() -> None:
@@ -28,6 +74,30 @@ def test_a_deterministic_episode_equals_a_rollout_with_the_same_policy() -> None
     assert set(rows.keys(include_nested=True, leaves_only=True)) == set(ROW_KEYS)
     for key in ROW_KEYS:
         torch.testing.assert_close(rows[key], rollout[key], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("alter", ALTERED)
+def test_every_policy_acts_as_it_does_when_it_is_called(alter: Callable[[Policy], TensorDictModuleBase]) -> None:
+    env = HopperMorph(num_runs=2, episode_steps=5, seed=0)
+    policy = alter(make_policy(env, num_cells=(8,)))
+    rows = run_episode(env, policy, deterministic=True)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected = torch.stack([policy(row)["action"] for row in rows.select("observation", "design")])
+    torch.testing.assert_close(rows["action"], expected)
+
+
+def test_a_policy_that_is_called_draws_from_the_generator_too() -> None:
+    def actions(seed: int) -> torch.Tensor:
+        env = HopperMorph(episode_steps=4, seed=0)
+        return run_episode(env, policy, rng=torch.Generator().manual_seed(seed))["action"]
+
+    policy = Negated(make_policy(HopperMorph(seed=0), num_cells=(8,)).network)
+    before = torch.get_rng_state()
+    first = actions(1)
+    assert torch.equal(first, actions(1))
+    assert not torch.equal(first, actions(2))
+    assert first.unique().numel() == first.numel()
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_only_the_last_row_is_truncated() -> None:

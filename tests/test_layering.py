@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 # Import only from a lower rank, or from your own room. The rooms of rank 1 do not know each other; rank 2 is one room.
-RANKS = {name: 0 for name in ("objectives.functional", "products", "angles", "randomness", "lazy", "tables")}
+RANKS = {name: 0 for name in ("objectives.functional", "products", "angles", "randomness", "calling", "lazy", "tables")}
 RANKS |= {name: 1 for name in ("envs", "models", "objectives", "designs", "buffers", "batches", "compiling")}
 RANKS |= {name: 2 for name in ("learner", "dynamics_learner", "episode", "imagination", "events", "agreement")}
 RANKS |= {name: 2 for name in ("continuation", "coadaptation", "design_loop", "divergence", "checkpoints", "saved_run")}

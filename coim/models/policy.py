@@ -15,10 +15,12 @@ import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import ProbabilisticActor, SafeProbabilisticModule, TanhNormal
+
+from coim.calling import altered_part
 
 from .scaling import InputScaling
-from .stacked import StackedMLP
+from .stacked import StackedLinear, StackedMLP
 
 LOG_SCALE_RANGE = (-20.0, 2.0)  # rlkit's LOG_SIG_MIN, LOG_SIG_MAX
 
@@ -68,7 +70,7 @@ class PolicyNetwork(nn.Module):
         return loc, log_scale.clamp(*LOG_SCALE_RANGE).exp()
 
     def for_design(self, design: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-        """Prepare `forward` for the steps of an episode, in which the designs stay.
+        """Prepare `forward` for the steps of an episode, in which the designs stay; see `Policy.is_unaltered`.
 
         Everything is looked up, scaled and laid out once; the arithmetic is the same. The weights are read at each
         call, so that it follows a learner that writes to them in place.
@@ -136,6 +138,17 @@ class Policy(ProbabilisticActor):
     def num_runs(self) -> int | None:
         """``K``, or None for a single run."""
         return self.network.mlp.num_runs
+
+    def is_unaltered(self) -> bool:
+        """Whether calling the policy does what its class and `PolicyNetwork.for_design` do.
+
+        It does not with another activation or distribution, with hooks, or with a `forward` of its own anywhere.
+        """
+        actor = (Policy, TensorDictModule, SafeProbabilisticModule)
+        network = (PolicyNetwork, InputScaling, StackedMLP, nn.ModuleList, StackedLinear, nn.ReLU)
+        head = self[-1]
+        plain = head.distribution_class is TanhNormal and not head.distribution_kwargs
+        return plain and altered_part(self, (*actor, *network)) is None
 
 
 def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num_runs: int | None = None) -> Policy:

@@ -20,6 +20,7 @@ from typing import TypeVar, cast
 import torch
 from torch import Tensor, nn
 
+from coim.calling import called_as
 from coim.products import Activation, affine, emulated
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
@@ -204,7 +205,8 @@ class StackedMLP(nn.Module):
     def serves_bare(self, x: Tensor, num_rows: int) -> bool:
         """Whether :meth:`forward_copy` is the better path for ``num_rows`` rows per copy.
 
-        That is so for many rows on a CPU while neither autograd nor a function transform nor a compiler looks on.
+        That is so for many rows on a CPU while neither autograd nor a function transform nor a compiler looks on, and
+        while layers and activation do nothing else than they were made for.
         """
         return (
             num_rows >= FEW_ROWS
@@ -215,6 +217,8 @@ class StackedMLP(nn.Module):
             and x.dtype in (torch.float32, torch.bfloat16)
             and not torch.compiler.is_compiling()
             and torch._C._functorch.peek_interpreter_stack() is None
+            and called_as(self.activation, type(self.activation))
+            and all(called_as(layer, StackedLinear) for layer in self.layers)
         )
 
     def keep_run(self, run: int) -> None:

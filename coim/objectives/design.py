@@ -16,9 +16,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule
+
+from coim.calling import called_as
 
 from .functional import design_value
 from .moving import move
@@ -163,7 +165,7 @@ class DesignValue(LossModule):
         methods = hasattr(self.policy, "deterministic_action") and hasattr(self.qvalue, "values")
         if keys != ("design", "state_action_value") or not methods:
             return False
-        plain = _called_as(self.policy, ProbabilisticActor) and _called_as(self.qvalue, TensorDictModule)
+        plain = called_as(self.policy, ProbabilisticActor) and called_as(self.qvalue, TensorDictModule)
         return plain and self.policy[-1].distribution_class is TanhNormal and not self.policy[-1].distribution_kwargs
 
     def _num_chunks(self, designs: Tensor) -> int:
@@ -190,9 +192,3 @@ class DesignValue(LossModule):
         if not designs.isfinite().all():
             bad = (~designs.isfinite().all(-1)).nonzero().flatten().tolist()
             raise ValueError(f"designs {bad} have NaN or infinite entries; project them with design_spec.project()")
-
-
-def _called_as(module: nn.Module, kind: type[nn.Module]) -> bool:
-    """Whether calling a module is calling one of that kind: it has neither a forward of its own nor hooks."""
-    own = type(module).forward is not kind.forward or "forward" in vars(module)
-    return not (own or module._forward_hooks or module._forward_pre_hooks)

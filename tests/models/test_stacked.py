@@ -5,6 +5,7 @@ import torch
 from torch import nn
 
 from coim.models import StackedMLP, select_run
+from coim.models.stacked import FEW_ROWS
 
 STACKS = [(None, None), (None, 3), (2, None), (2, 3)]
 
@@ -134,3 +135,13 @@ def test_bad_input_is_named():
         select_run(StackedMLP(5, 1, [7]), 0)
     with pytest.raises(IndexError, match=r"run 3 is outside 0 \.\. 2"):
         select_run(StackedMLP(5, 1, [7], num_runs=3), 3)
+
+
+@pytest.mark.parametrize("part", ["layer", "activation"])
+def test_hooks_count_in_every_batch(part):
+    mlp = StackedMLP(3, 2, (8,))
+    module = mlp.layers[0] if part == "layer" else mlp.activation
+    module.register_forward_hook(lambda module, given, out: out + 1)
+    rows = torch.randn(FEW_ROWS, 3)
+    with torch.no_grad():
+        torch.testing.assert_close(mlp(rows), torch.cat([mlp(half) for half in rows.chunk(2)]))
