@@ -63,7 +63,7 @@ def check_bodies(env: MorphEnv, evaluation_env: MorphEnv) -> None:
     for what, own, other in (
         ("task", env.task, evaluation_env.task),
         ("batch size", list(env.batch_size), list(evaluation_env.batch_size)),
-        ("device", str(env.device or "cpu"), str(evaluation_env.device or "cpu")),
+        ("device", str(env.design_spec.space.low.device), str(evaluation_env.design_spec.space.low.device)),
     ):
         if own != other:
             raise ValueError(f"evaluation_env has {what} {other}, env has {own}; make both alike but for their seeds")
@@ -107,6 +107,11 @@ def check_learners(
             f"side_by_side=True is for learners on the CPU, these are on {device}: two threads would wait for one "
             "device, and could not be captured in its graphs; leave it out"
         )
+    if (place := env.design_spec.space.low.device) != device:
+        raise ValueError(
+            f"the learners are on {device}, the tensors of the bodies on {place}, and Eq. 5 would meet designs from "
+            f"elsewhere; make both environments with device={str(device)!r}"
+        )
     return device
 
 
@@ -124,8 +129,8 @@ def check_dream(
         return
     if not isinstance(dream, WorldModelEnv):
         raise TypeError(
-            f"the dream is a {type(dream).__name__}, and imagination asks its model itself; pass a WorldModelEnv, which "
-            "of a TransformedEnv is its base_env"
+            f"the dream is a {type(dream).__name__}, and imagination asks its model itself; pass a WorldModelEnv, "
+            "which of a TransformedEnv is its base_env"
         )
     model = dream.ensemble
     if isinstance(model, GaussianEnsemble):

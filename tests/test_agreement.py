@@ -212,7 +212,8 @@ def test_learners_go_side_by_side_on_the_cpu_alone() -> None:
 
     with pytest.raises(ValueError, match="side_by_side=True is for learners on the CPU, these are on meta"):
         check_learners(ENV, elsewhere(), elsewhere(), None, side_by_side=True)
-    assert check_learners(ENV, elsewhere(), elsewhere(), None, side_by_side=False).type == "meta"
+    with pytest.raises(ValueError, match=r"on meta, the tensors of the bodies on cpu, .* with device='meta'"):
+        check_learners(ENV, elsewhere(), elsewhere(), None, side_by_side=False)
     with pytest.raises(ValueError, match="population is on meta, dynamics on cpu"):
         check_learners(ENV, elsewhere(), elsewhere(), DynamicsLearner(ensemble(), num_runs=2), side_by_side=False)
 
