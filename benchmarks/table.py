@@ -15,7 +15,8 @@ from typing import Any
 import torch
 
 from benchmarks.measure import Figure
-from recipes.machine import available_cores
+from coim.products import Choice, chosen
+from recipes.machine import available_cores, words_of
 from recipes.results import PACKAGES, git_revision
 
 OTHERS = {"stable_baselines3": "stable-baselines3", "sbx": "sbx-rl", "jax": "jax"}
@@ -31,6 +32,7 @@ def machine() -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "load before": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "widest instructions": torch.backends.cpu.get_cpu_capability(),
+        "products": chosen()._asdict(),
         "system": platform.platform(),
         "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES} | others,
         "revision": git_revision(),
@@ -51,7 +53,8 @@ def heading(found: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in found["versions"].items())
     return (
         f"{found['processor']}, {found['cores']} core(s), {found['widest instructions']}, load {found['load before']}; "
-        f"one thread where a row does not say otherwise, freed memory is kept as in real runs\n{versions}\n"
+        f"products by {words_of(Choice(**found['products']))}, one thread where a row does not say otherwise, freed "
+        f"memory is kept as in real runs\n{versions}\n"
         "floor: the matrix products of the same work alone, by torch.mm (MKL) in float32, in the same run"
     )
 

@@ -176,6 +176,7 @@ def in_full(records: Sequence[Record]) -> list[str]:
     origin = [
         {"revision": r.config.get("revision"), "started": r.config.get("started")}
         | dict(r.config.get("machine", {}))
+        | {f"products in {dtype}": library for dtype, library in r.config.get("products", {}).items()}
         | dict(r.config.get("versions", {}))
         for r in records
     ]

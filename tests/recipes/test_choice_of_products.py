@@ -46,6 +46,7 @@ def test_a_run_tells_and_notes_which_library_multiplies(
     config = config_of(tmp_path / "run")
     assert config["products"] == {"float32": "torch", "bfloat16": "emulated"}
     assert config["settings"]["products"] == "torch"
+    assert "products in bfloat16" in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_a_run_that_goes_on_keeps_its_products_and_says_where_others_would_be_taken(
