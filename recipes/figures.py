@@ -8,7 +8,6 @@ PDF, the numbers that it shows as CSV, short tables as Markdown too, and ``READM
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 import re
@@ -27,6 +26,7 @@ from recipes.plots.plot import Plot
 from recipes.reporting.page import FONT
 from recipes.reporting.records import number
 from recipes.settings import read_config
+from recipes.writing import as_csv, write_whole, written_aside
 
 MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
 OF_MODELS = (model_error, design_space, cartpole)  # what a folder without cells has, Fig. 4
@@ -73,7 +73,7 @@ def write_figures(study: Path) -> list[Plot]:
                 found.append(plot)
     for name in drawn_before(folder) - {plot.name for plot in found}:
         remove(folder, name)
-    (folder / "README.md").write_text(page(study, found), encoding="utf-8")
+    write_whole(folder / "README.md", page(study, found))
     return found
 
 
@@ -95,14 +95,14 @@ def write_plot(folder: Path, plot: Plot) -> None:
     remove(folder, plot.name)
     if plot.figure is None:
         return
-    plot.figure.savefig(files["png"], dpi=RESOLUTION)
-    plot.figure.savefig(files["pdf"], metadata={"CreationDate": None})
-    with files["csv"].open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(plot.rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: cell(value, digits=7) for key, value in row.items()} for row in plot.rows)
+    with written_aside(files["png"]) as aside:
+        plot.figure.savefig(aside, dpi=RESOLUTION)
+    with written_aside(files["pdf"]) as aside:
+        plot.figure.savefig(aside, metadata={"CreationDate": None})
+    rows = ({key: cell(value, digits=7) for key, value in row.items()} for row in plot.rows)
+    write_whole(files["csv"], as_csv(list(plot.rows[0]), rows))
     if plot.readable:
-        files["md"].write_text(f"{plot.caption}\n\n{table(plot.rows)}", encoding="utf-8")
+        write_whole(files["md"], f"{plot.caption}\n\n{table(plot.rows)}")
 
 
 def page(study: Path, plots: Iterable[Plot]) -> str:

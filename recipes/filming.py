@@ -6,7 +6,6 @@ Shapes: T steps, K runs.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from coim import SavedRun, TriedDesign, load_run
 from coim.envs.camera import Camera
 from recipes.commands import in_names
 from recipes.reporting.records import number
+from recipes.writing import written_aside
 
 FRAMES_PER_SECOND = 30  # at most; an environment that takes fewer steps in a second shows each of them
 TOP = 5
@@ -157,15 +157,13 @@ def write_film(path: Path, takes: Sequence[Take]) -> None:
     step_seconds = takes[0].step_seconds
     stride = max(1, math.ceil(1 / (FRAMES_PER_SECOND * step_seconds)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".new-{path.name}")
     rate = 1 / (stride * step_seconds)
-    try:
-        with imageio.get_writer(aside, fps=rate, codec="libx264", quality=8, macro_block_size=2) as writer:
-            for pictures in zip(*(shot.frames(stride) for shot in takes), strict=True):
-                writer.append_data(side_by_side(pictures))
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    with (
+        written_aside(path) as aside,
+        imageio.get_writer(aside, fps=rate, codec="libx264", quality=8, macro_block_size=2) as writer,
+    ):
+        for pictures in zip(*(shot.frames(stride) for shot in takes), strict=True):
+            writer.append_data(side_by_side(pictures))
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:

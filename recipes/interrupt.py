@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import platform
 import signal
@@ -23,6 +24,7 @@ except ImportError:  # not a Unix
 
 LOCK = ".lock"
 PATIENCE = 3  # s
+ANY_NAME = "backslashreplace"  # folders may have names that cannot be printed; standard error has always been so
 
 
 class Stopped(KeyboardInterrupt):
@@ -87,6 +89,8 @@ def on_command_line(*, own_process: bool, also: tuple[type[Exception], ...] = ()
     Raises:
         SystemExit: 128 + 2 after Ctrl-C, 128 + 15 after SIGTERM, or the line of an error.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors=ANY_NAME)
     try:
         with stopping_at_once():
             yield

@@ -25,6 +25,7 @@ from recipes.machine import available_cores, checked_device, prepare
 from recipes.parts import build
 from recipes.reporting.pictures import save
 from recipes.settings import Settings
+from recipes.writing import telling_full_disk
 
 # Imagined rows in the individual batches too: on a single body the population's networks never act.
 ARMS = {
@@ -131,7 +132,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 def write(path: Path, rows: list[list]) -> None:
     """Append rows to a CSV file."""
-    with path.open("a", newline="") as file:
+    with telling_full_disk(path), path.open("a", newline="") as file:
         csv.writer(file).writerows(rows)
 
 

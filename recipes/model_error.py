@@ -7,8 +7,6 @@ own recipe does and measures on the way; the same line again goes on with a run 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +25,7 @@ from recipes.probing.errors import change_variance
 from recipes.probing.probed import ProbedCoAdaptation, other_learner
 from recipes.probing.probes import Probes, joined
 from recipes.settings import Settings, parse
-from recipes.writing import write_whole
+from recipes.writing import as_csv, write_whole
 
 STATES = 3  # of which Fig. 4(b) is drawn, at random
 
@@ -165,11 +163,8 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
         rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)
     except ValueError as error:
         return f"no {FILE}: {error}"
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
-    write_whole(folder / FILE, text.getvalue())
+    shown = ({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
+    write_whole(folder / FILE, as_csv(list(rows[0]), shown))
     return f"model errors: {probed.path}\ndesign space: {folder / FILE}"
 
 

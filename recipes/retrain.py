@@ -14,8 +14,6 @@ skipped, what was stopped is resumed from its checkpoint.
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 import sys
@@ -37,7 +35,7 @@ from recipes.settings import saved_settings
 from recipes.studies.cluster import ray_running, without_words_of_ray
 from recipes.studies.conduct import Conductor, Resources, refuse_lack, take_up
 from recipes.studies.definition import Cell
-from recipes.writing import shortest, write_whole
+from recipes.writing import as_csv, shortest, write_whole
 
 RULE = {"top": 0.5, "most": 18}  # of Fig. 2
 DEFAULT = ", as the study gave to a first design (the paper: 300); --episodes takes another number"
@@ -159,11 +157,7 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
     for place, arm in itertools.product(runs.places, arms):
         if arm in runs.arms_at(place) and (*place, arm) not in there:
             print(f"{', '.join(place)}: no run of {arm} has an optimised design, there is nothing to retrain of it")
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for line in lines for key in line)), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    write_whole(path, text.getvalue())
+    write_whole(path, as_csv(list(dict.fromkeys(key for line in lines for key in line)), lines))
     return lines
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import functools
+import io
 import itertools
 import os
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -32,6 +34,25 @@ def shortest(value: float) -> str:
     return str(np.float32(value)).removesuffix(".0")
 
 
+def readable(text: str) -> str:
+    r"""A text that can be written as UTF-8: bytes of a file's name that are not UTF-8 become the sign for that.
+
+    Example:
+        >>> readable(os.fsdecode(b"M\xe4nner"))
+        'M\ufffdnner'
+    """
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
+def as_csv(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
+    """Rows as a CSV file has them."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
 def write_whole(path: Path, contents: str | bytes) -> None:
     """Write a file so that it has either its old contents or the new ones, whatever happens.
 
@@ -39,7 +60,7 @@ def write_whole(path: Path, contents: str | bytes) -> None:
         OSError: if it cannot be written; of a full disk in a sentence.
     """
     with written_aside(path) as aside:
-        aside.write_bytes(contents.encode() if isinstance(contents, str) else contents)
+        aside.write_bytes(readable(contents).encode() if isinstance(contents, str) else contents)
 
 
 @contextmanager

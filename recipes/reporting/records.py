@@ -17,6 +17,7 @@ import numpy as np
 from coim.envs import BODIES
 from coim.tables import DESIGN_PREFIX, OF_RUN, read_columns, read_table
 from recipes.results import entry_of_column
+from recipes.writing import readable
 
 Row = dict[str, Any]
 
@@ -119,9 +120,9 @@ def read_records(folders: Sequence[Path]) -> list[Record]:
     Raises:
         ValueError: if one of them is no run, has no rows yet, or is of another environment than the first.
     """
-    names = [folder.resolve().name for folder in folders]
+    names = [readable(folder.resolve().name) for folder in folders]
     if len(set(names)) < len(names):
-        names = [str(folder) for folder in folders]
+        names = [readable(str(folder)) for folder in folders]
     records = [read_record(folder, name) for folder, name in zip(folders, names)]
     environments = list(dict.fromkeys(record.environment for record in records))
     if len(environments) > 1:

@@ -14,7 +14,7 @@ from coim.envs import BODIES
 from coim.tables import OF_RUN, read_cells
 from recipes.checkpoint import refuse_lost_checkpoints
 from recipes.experiment import run
-from recipes.interrupt import LOCK
+from recipes.interrupt import ANY_NAME, LOCK
 from recipes.results import now
 from recipes.settings import FREE, Settings, plain, read_config, refuse_changes, saved_settings
 from recipes.writing import ASIDE
@@ -33,7 +33,7 @@ def compute(environment: str, settings: Settings, log: Path) -> None:
         log: what it says, and how it ended if not well, is written there.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a", buffering=1) as words, redirect_stdout(words), redirect_stderr(words):
+    with log.open("a", buffering=1, errors=ANY_NAME) as words, redirect_stdout(words), redirect_stderr(words):
         print(f"{STARTED} {now()} on {platform.node()}, process {os.getpid()}")
         try:
             run(BODIES[environment], environment, to_go_on(settings))

@@ -19,6 +19,8 @@ from typing import Any, TextIO
 
 import ray
 
+from recipes.interrupt import ANY_NAME
+
 ANSWER = 5.0  # s to wait for a cluster
 OBJECT_STORE = 80 * 2**20  # bytes; what a cell makes is on disk, nothing goes through Ray
 SOCKET = 103  # bytes of a socket's path on macOS; on Linux 107
@@ -113,7 +115,7 @@ def without_words_of_ray(folder: Path) -> Iterator[TextIO]:
     """
     terminal, words = sys.stdout, folder / "logs" / "ray.log"
     words.parent.mkdir(parents=True, exist_ok=True)
-    with words.open("a", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
+    with words.open("a", buffering=1, errors=ANY_NAME) as file, redirect_stdout(file), redirect_stderr(file):
         yield terminal
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import Any, Literal
 
 from coim.tables import Layout, read_table
 from recipes.studies.definition import Cell
-from recipes.writing import write_whole
+from recipes.writing import as_csv, write_whole
 
 State = Literal["waiting", "running", "finished", "failed"]
 
@@ -99,11 +97,7 @@ class Ledger:
 
 def in_csv(entries: Iterable[Entry]) -> str:
     """What stands in a ``ledger.csv``."""
-    text = io.StringIO()
-    rows = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    rows.writeheader()
-    rows.writerows(vars(entry) for entry in entries)
-    return text.getvalue()
+    return as_csv(COLUMNS, map(vars, entries))
 
 
 def read_ledger(path: Path) -> list[Entry]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -12,14 +13,18 @@ from typing import Any
 import pytest
 from interrupted_runs import resume, run
 
-from recipes import soak, writing
+from coim import HopperMorph, load_run
+from recipes import report, soak, writing
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints
+from recipes.experiment import main
 from recipes.interrupt import locked
 from recipes.replay_file import ReplayFile
 from recipes.report import write_report
 from recipes.results import Results
+from recipes.settings import read_config
 from recipes.writing import sync, warn_once, write_whole, written_aside
+from tests.recipes.test_experiment import tiny
 
 FSYNC = os.fsync
 
@@ -179,3 +184,23 @@ def test_a_disk_that_is_full_when_the_page_is_written_does_not_cost_the_run(
         with pytest.raises(OSError, match=rf"disk full: .*python -m recipes.report {folder}"):
             run(folder)
     assert soak.differences(whole, folder) == []
+
+
+def test_a_folder_whose_name_is_not_utf_8_has_a_run_a_page_and_a_comparison(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [tmp_path / os.fsdecode(name) for name in (b"M\xe4nner", b"Frau")]
+    try:
+        folders[0].mkdir()
+    except OSError:
+        pytest.skip("this file system has no such names")
+    printed = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(printed, encoding="utf-8", errors="strict", write_through=True))
+    for folder in folders:
+        main(HopperMorph, "hopper", tiny("--out", str(folder), "--num-designs", "1"))
+    report.main([str(folder) for folder in folders] + ["--out", str(tmp_path / "both.html")])
+    for page in (folders[0] / "report.html", tmp_path / "both.html"):
+        assert "M\ufffdnner" in page.read_text(encoding="utf-8")
+    assert rb"M\udce4nner/report.html" in printed.getvalue()
+    assert load_run(folders[0]).designs[0].number == 1
+    assert read_config(folders[0])["settings"]["out"] == str(folders[0])
