@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 
 import torch
@@ -139,7 +140,7 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
     """Fig. 4(b)'s numbers from the models as they are at the end; returns what happened in words.
 
     They are of the first run that has not diverged, and of random states among those through whose design enough of the
-    plane can be built.
+    plane can be built. All is computed on the CPU, where the simulator is, with copies of the models.
     """
     if not probed.seen:
         return f"no {FILE}: the run ended before its first measurement"
@@ -147,12 +148,13 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
     if not learning:
         return f"no {FILE}: the run diverged, and its model stands still since"
     run = learning[0]
-    seen = joined(probed.seen)[:, run]
-    tried = torch.stack([rows["design"][0, run] for rows in probed.seen])
+    seen = joined(probed.seen)[:, run].cpu()
+    tried = torch.stack([rows["design"][0, run] for rows in probed.seen]).cpu()
     order = torch.randperm(len(seen), generator=torch.Generator().manual_seed(probed.seed))
-    models, variance = {}, change_variance(probed.learners["delta"])  # the run axis is dropped from both
+    models, variance = {}, change_variance(probed.learners["delta"]).cpu()  # the run axis is dropped from both
     for predict, learner in sorted(probed.learners.items()):
-        models[predict] = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, run)
+        own = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, run)
+        models[predict] = deepcopy(own).cpu()
     variance = variance if variance.ndim == 1 else variance[run]
     simulator, bounds = probed.probes.simulator, body.DESIGN_BOUNDS
     try:

@@ -145,7 +145,9 @@ class ProbedCoAdaptation:
         self.other.load_state_dict(probed["other"])
         restore_generator(self._rng, probed["rng"])
         runs = self.algorithm.env.numel()
-        self.seen = [TensorDict(rows, [len(rows["design"]), runs]).unflatten_keys(".") for rows in probed["seen"]]
+        # Beside those that will be seen, wherever the run was before.
+        saved = [TensorDict(rows, [len(rows["design"]), runs]).unflatten_keys(".") for rows in probed["seen"]]
+        self.seen = [rows.to(self.algorithm.device) for rows in saved]
         self._table = Table(self.path, COLUMNS, keep=probed["csv_rows"])
 
     def _asked(self) -> dict[str, int]:
