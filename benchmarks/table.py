@@ -17,7 +17,7 @@ import torch
 from benchmarks.measure import Figure
 from coim.products import Choice, chosen
 from recipes.machine import available_cores, words_of
-from recipes.results import PACKAGES, git_revision
+from recipes.origin import PACKAGES, git_revision
 
 OTHERS = {"stable_baselines3": "stable-baselines3", "sbx": "sbx-rl", "jax": "jax"}
 COLUMNS = ("row", "ratio", "(min - max)", "against", "amount", "target", "met", "note")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +58,35 @@ OF_RUN = {  # files of a run's folder
     "designs.csv": Layout(needed=("run", "design", "kind", "predicted", "best_return"), words=WORDS, counts=COUNTS),
     "metrics.csv": Layout(needed=("run", "design", "episode"), words=WORDS, counts=COUNTS),
 }
+
+
+def design_columns(names: Sequence[str]) -> list[str]:
+    """Columns of a design in a CSV file; readers know them by how they begin, in older folders by ``xi_1, xi_2, ...``.
+
+    Example:
+        >>> design_columns(["torso", "right thigh"])
+        ['xi_torso', 'xi_right_thigh']
+    """
+    return [f"{DESIGN_PREFIX}{name.replace(' ', '_')}" for name in names]
+
+
+def entry_of_column(column: str) -> str | None:
+    """The name of an entry of the design from its column; None of other columns, and where older folders count.
+
+    Example:
+        >>> entry_of_column("xi_right_thigh"), entry_of_column("xi_2"), entry_of_column("run")
+        ('right thigh', None, None)
+    """
+    entry = column.removeprefix(DESIGN_PREFIX)
+    return None if entry == column or entry.isdigit() else entry.replace("_", " ")
+
+
+def same_columns(found: Sequence[str], wanted: Sequence[str]) -> bool:
+    """Whether two headers hold the same, whatever the entries of the design are called."""
+    return len(found) == len(wanted) and all(
+        one == other or (one.startswith(DESIGN_PREFIX) and other.startswith(DESIGN_PREFIX))
+        for one, other in zip(found, wanted)
+    )
 
 
 def read_table(path: Path, layout: Layout) -> list[dict[str, Cell]]:

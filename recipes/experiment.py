@@ -24,11 +24,12 @@ from recipes.machine import (
     prepare,
     words_of,
 )
+from recipes.origin import versions
 from recipes.parts import build
 from recipes.progress import Progress
 from recipes.report import write_report
 from recipes.reporting.pictures import draw_run
-from recipes.results import Results, folder_of, refuse_filled, versions
+from recipes.results import Results, folder_of, refuse_filled
 from recipes.settings import ELSEWHERE, QUICK, Settings, parse, read_config, saved_settings
 from recipes.wandb_log import WandbLog
 

@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
-import datetime
 import itertools
 import json
 import os
-import platform
-import secrets
-import subprocess
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
-from coim.products import chosen
-from coim.tables import DESIGN_PREFIX, OF_RUN, read_cells, read_columns
+from coim.tables import OF_RUN, design_columns, entry_of_column, read_cells, read_columns, same_columns
 from recipes.interrupt import LOCK, cannot_write
-from recipes.settings import Settings, changes, plain, read_config, saved_settings
+from recipes.origin import describe, note_resumption
+from recipes.settings import Settings
 from recipes.writing import ASIDE, shortest, telling_full_disk, write_whole
-
-PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
 
 
 class Results:
@@ -179,35 +171,6 @@ def where_diverged(event: DesignChosen | EpisodeDone | DesignDone, run: int) -> 
     return f"design {index + 1}, episode {episode + 1}"
 
 
-def design_columns(names: Sequence[str]) -> list[str]:
-    """Columns of a design in a CSV file; readers know them by how they begin, in older folders by ``xi_1, xi_2, ...``.
-
-    Example:
-        >>> design_columns(["torso", "right thigh"])
-        ['xi_torso', 'xi_right_thigh']
-    """
-    return [f"{DESIGN_PREFIX}{name.replace(' ', '_')}" for name in names]
-
-
-def entry_of_column(column: str) -> str | None:
-    """The name of an entry of the design from its column; None of other columns, and where older folders count.
-
-    Example:
-        >>> entry_of_column("xi_right_thigh"), entry_of_column("xi_2"), entry_of_column("run")
-        ('right thigh', None, None)
-    """
-    entry = column.removeprefix(DESIGN_PREFIX)
-    return None if entry == column or entry.isdigit() else entry.replace("_", " ")
-
-
-def same_columns(found: Sequence[str], wanted: Sequence[str]) -> bool:
-    """Whether two headers hold the same, whatever the entries of the design are called."""
-    return len(found) == len(wanted) and all(
-        one == other or (one.startswith(DESIGN_PREFIX) and other.startswith(DESIGN_PREFIX))
-        for one, other in zip(found, wanted)
-    )
-
-
 class Table:
     """A CSV file that grows; every append is on disk before the next line of the program.
 
@@ -258,39 +221,6 @@ def _cell(value: Any) -> Any:
     return shortest(value) if isinstance(value, float) else "" if value is None else value
 
 
-def versions() -> dict[str, str]:
-    """Of everything that decides about the numbers."""
-    return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
-
-
-def describe(environment: str, settings: Settings) -> dict[str, Any]:
-    """Everything that somebody needs to repeat the run."""
-    return {
-        "environment": environment,
-        "settings": plain(settings),
-        "products": chosen()._asdict(),
-        "versions": versions(),
-        "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
-        "revision": git_revision(),
-        "started": now(),
-        "wandb_id": secrets.token_hex(4),  # one W&B run holds the whole curve, however often it is resumed
-    }
-
-
-def note_resumption(folder: Path, settings: Settings) -> None:
-    """Write into ``config.json`` that the run went on: when, by which code, and with which other settings."""
-    config = read_config(folder)
-    moved = changes(saved_settings(folder), settings)
-    products = chosen()._asdict()
-    config["settings"] = plain(dataclasses.replace(settings, resume=None))
-    config["products"] = products
-    config["resumed"] = [
-        *config.get("resumed", []),
-        {"at": now(), "revision": git_revision(), "products": products, "versions": versions(), "changed": moved},
-    ]
-    write_whole(folder / "config.json", json.dumps(config, indent=2) + "\n")
-
-
 def refuse_filled(folder: Path) -> None:
     """Leave a folder alone that holds anything but our own lock, and a first file that was not finished."""
     ours = {LOCK, ASIDE.format("config.json")}
@@ -299,20 +229,6 @@ def refuse_filled(folder: Path) -> None:
             f"{folder} already holds something; name another folder with --out, move it away, or go on with the run in "
             f"it by --resume {folder}"
         )
-
-
-def now() -> str:
-    """The time in UTC, to the second."""
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def git_revision() -> str | None:
-    """Commit of the checkout that this file lies in, with ``-dirty`` where it was changed; None outside of one."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from coim import EpisodeDone, Event
 from coim.events import running
-from recipes.results import design_columns
+from coim.tables import design_columns
 from recipes.settings import read_config
 
 PATIENCE = 60  # s that the end of a run waits for what W&B still has to write or send

@@ -15,10 +15,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from coim.tables import Layout
+from coim.tables import Layout, design_columns
 from recipes.probing.errors import Model
 from recipes.probing.truth import PlacedSimulator
-from recipes.results import design_columns
 
 SIDE = 41  # points along each of the two directions
 AREA = 0.05  # of the square that two entries of a design span: of less, a picture shows next to nothing

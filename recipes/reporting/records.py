@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from coim.envs import BODIES
-from coim.tables import DESIGN_PREFIX, OF_RUN, read_columns, read_table
-from recipes.results import entry_of_column
+from coim.tables import DESIGN_PREFIX, OF_RUN, entry_of_column, read_columns, read_table
 from recipes.writing import readable
 
 Row = dict[str, Any]

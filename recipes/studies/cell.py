@@ -15,7 +15,7 @@ from coim.tables import OF_RUN, read_cells
 from recipes.checkpoint import refuse_lost_checkpoints
 from recipes.experiment import run
 from recipes.interrupt import ANY_NAME, LOCK
-from recipes.results import now
+from recipes.origin import now
 from recipes.settings import FREE, Settings, plain, read_config, refuse_changes, saved_settings
 from recipes.writing import ASIDE
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from coim import HopperMorph
+from coim.tables import design_columns
 from recipes import experiment
 from recipes.figures import write_figures
 from recipes.plots.runs import read_runs
-from recipes.results import design_columns
 from recipes.retrain import Retrain, best_designs, cell_of, choose, episodes_in_words, main
 from recipes.settings import Settings, parse, plain
 from tests.recipes.made_up_study import read_table, write_cell

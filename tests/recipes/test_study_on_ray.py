@@ -21,8 +21,8 @@ import pytest
 import torch
 
 from coim import HopperMorph
+from coim.tables import design_columns
 from recipes.experiment import run as run_recipe
-from recipes.results import design_columns
 from recipes.soak import differences
 from recipes.studies import cluster as cluster_module
 from recipes.studies.cluster import LONGEST, SOCKET, SOCKETS, short_folder, token_without_file, without_words_of_ray
