@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import imageio.v2 as imageio
 import numpy as np
@@ -16,11 +17,17 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDict
 
-from coim import SavedRun, TriedDesign, load_run
+from coim import SavedRun, TriedDesign, load_run, run_episode
+from coim.envs import BODIES
 from coim.envs.camera import Camera
+from coim.saved_run import policy_path, read_config
+from recipes.bodies import imported_body
 from recipes.commands import in_names
+from recipes.progress import counted
 from recipes.reporting.records import number
-from recipes.writing import written_aside
+from recipes.writing import naming_out, written_aside
+
+PolicyName = Literal["best", "population"]
 
 FRAMES_PER_SECOND = 30  # at most; an environment that takes fewer steps in a second shows each of them
 TOP = 5
@@ -35,6 +42,7 @@ class Take:
 
     Attributes:
         tried: the design.
+        policy: who moves it.
         entries: of the design, by their names.
         camera: in front of its body.
         poses: joint positions before each step and after the last, ``[T + 1, nq]``.
@@ -44,6 +52,7 @@ class Take:
     """
 
     tried: TriedDesign
+    policy: PolicyName
     entries: Sequence[str]
     camera: Camera
     poses: np.ndarray
@@ -56,14 +65,27 @@ class Take:
         with self.camera:
             for t in range(0, len(self.poses), stride):
                 time, speed = t * self.step_seconds, round(self.speed[t], 2) + 0.0  # no "-0.00"
+                best = f"best return {number(self.tried.best_return)}"
                 lines = (
-                    f"design {self.tried.number}, {self.tried.kind}: best return {number(self.tried.best_return)}",
+                    f"design {self.tried.number}, {self.tried.kind}: "
+                    + (best if self.policy == "best" else "the population's policy"),
                     f"{time:.1f} s   {speed:+.2f} m/s   return {number(self.returned[t])}",
                 )
                 yield labelled(self.camera.photograph(self.poses[t]), lines, self.entries)
 
 
-def film(folder: Path, *, design: str, run: int | None, steps: int | None, width: int, height: int) -> Iterator[Path]:
+def film(
+    folder: Path,
+    *,
+    design: str,
+    run: int | None,
+    steps: int | None,
+    policy: PolicyName,
+    body: str | None,
+    out: Path | None,
+    width: int,
+    height: int,
+) -> Iterator[Path]:
     """Write the films that are asked for, one after the other.
 
     Args:
@@ -71,6 +93,9 @@ def film(folder: Path, *, design: str, run: int | None, steps: int | None, width
         design: ``best``, ``top5``, ``all``, or a number from 1.
         run: one of K; None takes the one with the best return of what is asked for.
         steps: to show; None shows the run's whole episode.
+        policy: that of each design's best evaluation, or the population's.
+        body: class of the body, ``module:Class``; None takes the one that the run's environment names.
+        out: folder for the films; None takes ``videos/`` of the run's.
         width: pixels of one picture.
         height: likewise.
 
@@ -78,7 +103,8 @@ def film(folder: Path, *, design: str, run: int | None, steps: int | None, width
         Each film, when it is written.
 
     Raises:
-        ValueError: if there is no such run or design, or a size cannot be filmed.
+        ValueError: if there is no such run, design, policy or body, or a size cannot be filmed.
+        OSError: if a film cannot be written.
         RuntimeError: if there is nothing to draw with; the sentence says what to install and set.
     """
     for name, value in (("width", width), ("height", height)):
@@ -87,20 +113,45 @@ def film(folder: Path, *, design: str, run: int | None, steps: int | None, width
     if steps is not None and steps < 1:
         raise ValueError(f"steps is {steps}, it must be at least 1; leave it out for the whole episode")
     torch.set_num_threads(1)  # as in training: another number could round otherwise
-    loaded = load_run(folder)
+    loaded = opened(folder, body)
     if run is not None and not 0 <= run < loaded.bodies.numel():
         raise ValueError(f"run {run} is not in {folder}, which has runs 0 .. {loaded.bodies.numel() - 1}")
     chosen = choose(loaded, design, run)
+    if policy == "best":
+        refuse_lost_policies(folder, chosen)
     if steps is not None:
         loaded.bodies.episode_steps = steps
-    several = loaded.bodies.numel() > 1
     together = [chosen] if design == "top5" else [[tried] for tried in chosen]
     for designs in together:
-        name = "top5" if design == "top5" else f"design-{designs[0].number}"
-        prefix = f"run-{designs[0].run}-" if several else ""
-        path = folder / "videos" / f"{prefix}{name}.mp4"
-        write_film(path, [take(loaded, tried, width, height) for tried in designs])
+        parts = ["top5" if design == "top5" else f"design-{designs[0].number}"]
+        if loaded.bodies.numel() > 1:
+            parts.insert(0, f"run-{designs[0].run}")
+        if policy == "population":
+            parts.append(policy)
+        path = (out or folder / "videos") / f"{'-'.join(parts)}.mp4"
+        write_film(path, [take(loaded, tried, policy, width, height) for tried in designs])
         yield path
+
+
+def opened(folder: Path, body: str | None) -> SavedRun:
+    """A run's folder; that its body is not known is told with the option that names one."""
+    environment = read_config(folder)["environment"]
+    if body is None and environment not in BODIES:
+        raise ValueError(
+            f"{folder} holds a run of {environment!r}, which is none of {', '.join(BODIES)}; name the class of its "
+            "body with --body module:Class"
+        )
+    return load_run(folder, body=imported_body(body))
+
+
+def refuse_lost_policies(folder: Path, chosen: Sequence[TriedDesign]) -> None:
+    """Say of designs whose policy was not kept, or was not copied, what can be filmed in its place."""
+    lost = sorted({tried.number for tried in chosen if not policy_path(folder, tried.number).is_file()})
+    if lost:
+        raise ValueError(
+            f"{folder} keeps no policy of design {', '.join(map(str, lost))}; to film the one that serves every design "
+            "add --policy population"
+        )
 
 
 def choose(loaded: SavedRun, design: str, run: int | None) -> list[TriedDesign]:
@@ -127,11 +178,19 @@ def choose(loaded: SavedRun, design: str, run: int | None) -> list[TriedDesign]:
     return own[: TOP if design == "top5" else 1]
 
 
-def take(loaded: SavedRun, tried: TriedDesign, width: int, height: int) -> Take:
-    """Play the best evaluation of a design again, twice: for its actions, and for the poses that they led to."""
+def take(loaded: SavedRun, tried: TriedDesign, policy: PolicyName, width: int, height: int) -> Take:
+    """Play an episode of a design twice: for the actions, and for the poses that they lead to."""
     bodies, row = loaded.bodies, tried.run
-    actions = loaded.best_episode(tried.number)["action"]
-    bodies.reset(TensorDict({"design": loaded.rewind(tried.number)}, bodies.batch_size))
+    if policy == "best":
+        design, network = loaded.rewind(tried.number), loaded.policy_of(tried.number)
+    else:
+        same = {other.run: other.design for other in loaded.designs if other.number == tried.number}
+        design = torch.stack([same.get(other, tried.design) for other in range(bodies.numel())])
+        network = loaded.population.policy
+    start = bodies.get_simulation_state()
+    actions = run_episode(bodies, network, design=design, deterministic=True)["action"]
+    bodies.set_simulation_state(start)
+    bodies.reset(TensorDict({"design": design}, bodies.batch_size))
     simulations = bodies.simulations
     poses, speed, rewards = [simulations.qpos[row].copy()], [float(simulations.qvel[row, 0])], [0.0]
     for action in actions:
@@ -143,6 +202,7 @@ def take(loaded: SavedRun, tried: TriedDesign, width: int, height: int) -> Take:
             bodies.reset(TensorDict({"_reset": broken}, bodies.batch_size))
     return Take(
         tried=tried,
+        policy=policy,
         entries=in_names(tried.design.tolist(), type(bodies)),
         camera=bodies.camera(row, width=width, height=height),
         poses=np.stack(poses),
@@ -156,14 +216,16 @@ def write_film(path: Path, takes: Sequence[Take]) -> None:
     """Film one episode, or several beside each other, at the speed at which they happened."""
     step_seconds = takes[0].step_seconds
     stride = max(1, math.ceil(1 / (FRAMES_PER_SECOND * step_seconds)))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rate = 1 / (stride * step_seconds)
-    with (
-        written_aside(path) as aside,
-        imageio.get_writer(aside, fps=rate, codec="libx264", quality=8, macro_block_size=2) as writer,
-    ):
-        for pictures in zip(*(shot.frames(stride) for shot in takes), strict=True):
-            writer.append_data(side_by_side(pictures))
+    rate, total = 1 / (stride * step_seconds), math.ceil(len(takes[0].poses) / stride)
+    together = zip(*(shot.frames(stride) for shot in takes), strict=True)
+    with naming_out(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            written_aside(path) as aside,
+            imageio.get_writer(aside, fps=rate, codec="libx264", quality=8, macro_block_size=2) as writer,
+        ):
+            for pictures in counted(together, total, f"{path.name}: pictures"):
+                writer.append_data(side_by_side(pictures))
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-from typing import TextIO
+import time
+from collections.abc import Iterable, Iterator
+from typing import TextIO, TypeVar
 
 import torch
 from torch import Tensor
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from coim.events import running
-from recipes.forecast import Forecast
+from recipes.forecast import Forecast, in_words
+
+EVERY, EVERY_LIVE = 10.0, 0.2  # s between two lines of a piece of work
+PieceT = TypeVar("PieceT")
 
 
 class Progress:
@@ -106,6 +111,32 @@ class Progress:
         if self._live and not self._quiet and self._episodes:
             self._stream.write("\n")
             self._stream.flush()
+
+
+def counted(pieces: Iterable[PieceT], total: int, what: str, *, stream: TextIO | None = None) -> Iterator[PieceT]:
+    """Pass pieces of work on, and say how many are done: a live line on a terminal, elsewhere one every ten seconds.
+
+    Args:
+        pieces: each is worked on before the next is asked for.
+        total: how many they are.
+        what: how a line begins.
+        stream: where to write; None takes standard error.
+    """
+    stream = stream or sys.stderr
+    live = stream.isatty()
+    begun = said = time.monotonic()
+    line = f"{what}: 0 of {total}"
+    for done, piece in enumerate(pieces, 1):
+        if line:
+            stream.write(f"\r{line.ljust(60)}" if live else f"{line}\n")
+            stream.flush()
+        yield piece
+        now, line = time.monotonic(), ""
+        if now - said >= (EVERY_LIVE if live else EVERY):
+            line, said = f"{what}: {done} of {total}, about {in_words((now - begun) * (total - done) / done)} left", now
+    if live:
+        stream.write(f"\r{' ' * 60}\r")
+        stream.flush()
 
 
 def mishaps(event: EpisodeDone) -> list[str]:

@@ -24,6 +24,7 @@ else:
     with env.camera(0, width=160, height=120) as camera:
         places = (0.0, 0.5, 200.0, 1.99, 2.01)
         pictures = [camera.photograph(qpos + [x, *[0] * (len(qpos) - 1)]).astype(int) for x in places]
+        assert camera._model.vis.quality.shadowsize == 1024  # 4096 would double what a picture takes
     here, half, far, before, after = pictures
     assert (here == small).all()
     print("CHANGE", *(int(np.abs(a - b).sum()) for a, b in ((here, half), (here, far), (before, after))))

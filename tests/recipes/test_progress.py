@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+from itertools import count
 
 import pytest
 import torch
 
 from coim import DesignChosen, DesignDone, EpisodeDone
 from recipes.forecast import Forecast, Work
-from recipes.progress import Progress
+from recipes.progress import Progress, counted
 
 FIELDS = ("design 1/2 first", "episode 2", "return 5.0 (best 7.0)", "imagined 20%", "model error 0.250", "60 updates/s")
 
@@ -125,3 +126,24 @@ def test_an_interrupted_start_leaves_no_empty_line() -> None:
     stream = Terminal()
     Progress(num_designs=1, forecast=Forecast(Work(1, 0, 30)), updates=1, stream=stream).end()
     assert stream.getvalue() == ""
+
+
+def test_pieces_of_work_are_counted_every_ten_seconds_and_pass_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = count()
+    monkeypatch.setattr("recipes.progress.time.monotonic", lambda: 4.0 * next(clock))  # 4 s a piece
+    stream = io.StringIO()
+    assert list(counted("abcdefgh", 8, "film: pictures", stream=stream)) == list("abcdefgh")
+    assert stream.getvalue().splitlines() == [
+        "film: pictures: 0 of 8",
+        "film: pictures: 3 of 8, about 20 s left",
+        "film: pictures: 6 of 8, about 8 s left",
+    ]
+
+
+def test_on_a_terminal_the_count_is_one_line_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stream = count(), Terminal()
+    monkeypatch.setattr("recipes.progress.time.monotonic", lambda: 4.0 * next(clock))
+    assert list(counted("ab", 2, "pictures", stream=stream)) == ["a", "b"]
+    assert [line.strip() for line in stream.getvalue().split("\r")] == [
+        "", "pictures: 0 of 2", "pictures: 1 of 2, about 4 s left", "", "",
+    ]  # fmt: skip

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +16,9 @@ import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 from interrupted_runs import run
 
-from coim import TriedDesign, load_run
-from recipes.filming import choose, film, labelled, side_by_side, take
-from recipes.watch import main
+from coim import TriedDesign, load_run, run_episode
+from recipes.filming import Take, choose, film, labelled, side_by_side, take, write_film
+from recipes.watch import Watch, main
 
 
 def tried(run: int, number: int, best_return: float) -> TriedDesign:
@@ -63,9 +65,8 @@ def test_a_design_that_is_not_there_is_refused(design: str, run: int | None, sen
     ("given", "sentence"), [({"width": 65}, "width is 65, it must be even"), ({"steps": 0}, "steps is 0")]
 )
 def test_a_size_that_cannot_be_filmed_is_refused(tmp_path: Path, given: dict[str, int], sentence: str) -> None:
-    asked = {"design": "best", "run": None, "steps": None, "width": 64, "height": 64} | given
     with pytest.raises(ValueError, match=sentence):
-        next(film(tmp_path, **asked))
+        next(film(**vars(Watch(folder=tmp_path, **given))))
 
 
 def test_a_folder_without_a_run_is_one_sentence(tmp_path: Path) -> None:
@@ -118,7 +119,7 @@ def test_what_is_filmed_is_the_evaluation_with_the_best_return(fleet: Path, monk
     monkeypatch.setattr("coim.envs.morph.MorphEnv.camera", lambda *args, **kwargs: None)
     loaded = load_run(fleet)
     for design in loaded.designs:
-        shot, rows = take(loaded, design, 64, 64), loaded.best_episode(design.number)[:, design.run]
+        shot, rows = take(loaded, design, "best", 64, 64), loaded.best_episode(design.number)[:, design.run]
         assert shot.returned[-1] == pytest.approx(design.best_return, rel=1e-6)
         assert torch.allclose(torch.tensor(shot.poses[:-1, 1]).float(), rows["observation"][:, 0])  # height
         assert torch.allclose(torch.tensor(shot.speed[1:]).float(), rows["next", "observation"][:, 5])
@@ -133,6 +134,7 @@ def test_films_move_at_the_speed_at_which_it_happened(fleet: Path) -> None:
     assert said.returncode == 0, said.stderr
     path = fleet / "videos" / "run-1-top5.mp4"
     assert said.stdout.split() == [str(path)]
+    assert said.stderr.splitlines() == [f"reading {fleet}", "run-1-top5.mp4: pictures: 0 of 13"]
     assert [found.name for found in path.parent.iterdir()] == [path.name]
     read = subprocess.run(
         [get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
@@ -146,6 +148,59 @@ def test_films_move_at_the_speed_at_which_it_happened(fleet: Path) -> None:
         moved = np.abs(frames[one] - frames[other])[40:64]  # below the label
         for left, right in ((0, 96), (100, 196)):
             assert moved[:, left:right].mean() > 0.5
+
+
+@pytest.fixture
+def copied(fleet: Path, tmp_path: Path) -> Path:
+    """The run in a folder from which its policies were left away."""
+    return shutil.copytree(fleet, tmp_path / "copied", ignore=shutil.ignore_patterns("policies", "videos"))
+
+
+@pytest.fixture
+def filmed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, list[Take]]]:
+    """Films that would have been written."""
+    films: list[tuple[Path, list[Take]]] = []
+    monkeypatch.setattr("coim.envs.morph.MorphEnv.camera", lambda *args, **kwargs: None)
+    monkeypatch.setattr("recipes.filming.write_film", lambda path, takes: films.append((path, takes)))
+    return films
+
+
+def test_a_run_without_its_policies_is_filmed_with_that_of_the_population(copied: Path, filmed: list) -> None:
+    with pytest.raises(SystemExit, match=r"keeps no policy of design 2; to film .* add --policy population"):
+        main([str(copied), "--design", "2", "--run", "1"])
+    main([str(copied), "--design", "2", "--run", "1", "--policy", "population"])
+    ((path, (shot,)),) = filmed
+    assert path == copied / "videos" / "run-1-design-2-population.mp4"
+    loaded = load_run(copied, run=1)
+    design = next(tried.design for tried in loaded.designs if tried.number == 2)
+    alone = run_episode(loaded.bodies, loaded.population.policy, design=design[None], deterministic=True)
+    assert shot.poses.shape == (61, 6)
+    assert shot.tried.design.equal(design)
+    assert abs(shot.poses[0, 1] - float(alone["observation"][0, 0, 0])) < 0.02  # another start of the same body
+
+
+def test_films_of_a_folder_that_is_not_ours_go_where_out_says(
+    fleet: Path, filmed: list, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main([str(fleet), "--design", "1", "--run", "0", "--out", str(tmp_path / "films")])
+    assert [path for path, _ in filmed] == [tmp_path / "films" / "run-0-design-1.mp4"]
+
+    def refuse(folder: Path, **_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("pathlib.Path.mkdir", refuse)
+    shot = SimpleNamespace(step_seconds=0.01, poses=np.zeros((2, 6)), frames=lambda stride: iter(()))
+    with pytest.raises(OSError, match=r"/videos cannot be written to \(Permission denied\); .* with --out"):
+        write_film(fleet / "videos" / "film.mp4", [shot])
+
+
+def test_a_body_that_is_not_ours_is_filmed_if_its_class_is_named(copied: Path, filmed: list) -> None:
+    config = json.loads((copied / "config.json").read_text())
+    (copied / "config.json").write_text(json.dumps(config | {"environment": "their_hopper"}))
+    with pytest.raises(SystemExit, match=r"a run of 'their_hopper', .* with --body module:Class"):
+        main([str(copied)])
+    main([str(copied), "--policy", "population", "--body", "coim.envs.hopper:HopperMorph"])
+    assert len(filmed) == 1
 
 
 def test_without_a_way_to_draw_one_sentence_says_what_to_install(fleet: Path) -> None:
