@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import AsyncEnvPool, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 
 def body_of(env: EnvBase) -> tuple[EnvBase, bool]:
-    """Find the environment inside of transforms and of `SerialEnv` or `ParallelEnv`.
+    """Find the environment inside of transforms and of `SerialEnv`, `ParallelEnv` or `AsyncEnvPool`.
 
     Args:
         env: any environment; what is not wrapped is its own body. Of the workers of a batched one, another of each is
@@ -28,14 +28,20 @@ def body_of(env: EnvBase) -> tuple[EnvBase, bool]:
         body, rewritten = body_of(env.base_env)
         transforms = [part for part in env.transform.modules() if isinstance(part, Transform)]
         return body, rewritten or any("observation" in transform.out_keys for transform in transforms)
-    if isinstance(env, BatchedEnvBase):
+    if isinstance(env, BatchedEnvBase | AsyncEnvPool):
         with torch.random.fork_rng(devices=[]):
-            workers = [body_of(make(**given)) for make, given in zip(env.create_env_fn, env.create_env_kwargs)]
+            workers = [body_of(worker) for worker in _workers(env)]
         kinds = {(type(body).__name__, "rewritten" if rewritten else "bare") for body, rewritten in workers}
         if len(kinds) > 1:
             raise ValueError(f"the workers have unlike bodies, {sorted(kinds)}; make the networks for one of them")
         return workers[0]
     return env, False
+
+
+def _workers(env: BatchedEnvBase | AsyncEnvPool) -> list[EnvBase]:
+    if isinstance(env, AsyncEnvPool):
+        return [maker if isinstance(maker, EnvBase) else maker() for maker in env.env_makers]
+    return [make(**given) for make, given in zip(env.create_env_fn, env.create_env_kwargs)]
 
 
 def design_bounds(env: EnvBase) -> tuple[Tensor, Tensor, Tensor]:

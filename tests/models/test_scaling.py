@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import torch
@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import (
+    AsyncEnvPool,
     Compose,
     EnvBase,
     ObservationNorm,
@@ -116,6 +117,15 @@ def test_designs_are_scaled_by_the_bounds_that_networks_see() -> None:
     policy = make_policy(normalised("design"), num_cells=(8,))  # 2 xi + 1: from 2 to 5
     design = policy.network.scaling.scaled_design(torch.tensor([2.0, 3.5, 5.0, 5.0]))  # type: ignore[union-attr]
     assert design.tolist() == [-1.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("start", [HopperMorph, HopperMorph(seed=0)])
+def test_bodies_in_a_pool_are_scaled_alike(start: Any) -> None:
+    pool = AsyncEnvPool([start, start], backend="threading")
+    try:
+        assert constants(pool) == constants(HopperMorph(seed=0))
+    finally:
+        pool.close()
 
 
 def test_workers_with_unlike_bodies_are_refused() -> None:
