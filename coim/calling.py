@@ -6,15 +6,14 @@ from collections.abc import Collection
 
 from torch import nn
 
-HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-
 
 def called_as(module: nn.Module, *kinds: type[nn.Module]) -> bool:
     """Whether calling a module is calling one of these kinds: it has neither a forward of its own nor hooks.
 
     Its parts are not looked at; see :func:`altered_part`.
     """
-    return _forward_of(module, kinds) and not any(getattr(module, hooks) for hooks in HOOKS)
+    hooks = module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
+    return not hooks and _forward_of(module, kinds)
 
 
 def altered_part(network: nn.Module, kinds: Collection[type[nn.Module]]) -> str | None:
@@ -36,4 +35,4 @@ def altered_part(network: nn.Module, kinds: Collection[type[nn.Module]]) -> str 
 
 
 def _forward_of(module: nn.Module, kinds: Collection[type[nn.Module]]) -> bool:
-    return "forward" not in vars(module) and any(type(module).forward is kind.forward for kind in kinds)
+    return type(module).forward in [kind.forward for kind in kinds] and "forward" not in vars(module)

@@ -31,7 +31,7 @@ def check_sac_networks(policy: Policy, qvalue: QValue) -> None:
     """Refuse a policy or critics that compute something else, or do not see the same numbers.
 
     Raises:
-        TypeError: naming the part that is another.
+        TypeError: naming the part that is another, or a weight that must not be trained.
         ValueError: if the two scale their inputs differently.
     """
     for network in (policy, qvalue):
@@ -72,7 +72,7 @@ def check_ensemble(ensemble: GaussianEnsemble) -> None:
     """Refuse an ensemble that computes something else.
 
     Raises:
-        TypeError: naming the part that is another.
+        TypeError: naming the part that is another, or a weight that must not be trained.
     """
     _check_parts(ensemble, OF_ENSEMBLE, "DynamicsLearner", "EnsembleNLLLoss")
 
@@ -83,6 +83,12 @@ def _check_parts(network: nn.Module, kinds: tuple[type[nn.Module], ...], learner
         raise TypeError(
             f"{learner} knows the gradients of the networks of coim.models alone, and {altered}; train it with {loss} "
             "and an optimiser"
+        )
+    frozen = [name for name, parameter in network.named_parameters() if not parameter.requires_grad]
+    if frozen:
+        raise TypeError(
+            f"{learner} trains all weights, and {frozen[0]} of the {type(network).__name__} has requires_grad=False; "
+            f"train the others with {loss} and an optimiser"
         )
 
 

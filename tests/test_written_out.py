@@ -60,6 +60,11 @@ def other_layer(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
     return policy, qvalue
 
 
+def frozen_layer(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
+    policy.network.mlp.layers[0].weight.requires_grad_(False)
+    return policy, qvalue
+
+
 def other_distribution(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
     policy[-1].distribution_kwargs = {"low": -2.0, "high": 2.0}
     return policy, qvalue
@@ -73,6 +78,10 @@ def other_distribution(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
         (other_policy, "Negated, a Negated, has a forward of its own"),
         (other_forward, "QValue.module, a QValueNetwork, has a forward of its own"),
         (other_layer, r"QValue.module.mlp.layers.0, a StackedLinear, has hooks; train it with CoImSACLoss"),
+        (
+            frozen_layer,
+            r"trains all weights, and module.0.module.mlp.layers.0.weight of the Policy has requires_grad=Fal",
+        ),
         (other_distribution, r"a TanhNormal on \[-1, 1\], not of TanhNormal with {'low': -2.0, 'high': 2.0}"),
     ],
 )
