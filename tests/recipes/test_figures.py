@@ -185,7 +185,7 @@ def test_a_study_that_has_just_begun_says_what_is_missing_and_keeps_no_old_figur
 
 def test_a_study_of_which_every_run_diverged_at_once_is_told_not_drawn(tmp_path: Path) -> None:
     folder = write_cell(tmp_path, "hopper-forward-none-0", [float("nan")], diverged=[0])
-    write_table(folder / "designs.csv", ["run"], [])
+    write_table(folder / "designs.csv", ["run", "design", "kind", "predicted", "best_return"], [])
     found = {plot.name: plot for plot in write_figures(tmp_path)}
     assert found["statistics_arms"].figure is None
     assert "1 of them diverged" in found["statistics_arms"].caption
