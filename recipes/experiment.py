@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from recipes.machine import (
     check_compiler,
     checked_device,
     choose_products,
+    folder_of_compiled_code,
     prepare,
     words_of,
 )
@@ -32,6 +34,7 @@ from recipes.reporting.pictures import draw_run
 from recipes.results import Results, folder_of, refuse_filled
 from recipes.settings import ELSEWHERE, QUICK, Settings, parse, read_config, saved_settings
 from recipes.wandb_log import WandbLog
+from recipes.writing import says_full
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
@@ -116,6 +119,11 @@ def train(
         except OSError as error:
             first = f"make {folder} writable; " if says_read_only(error) else ""
             raise OSError(f"{error}; {first}{again}") from error
+        except RuntimeError as error:  # of Inductor, with its compiler's words
+            if not says_full(error):
+                raise
+            places = " and ".join(dict.fromkeys([str(folder_of_compiled_code()), tempfile.gettempdir()]))
+            raise OSError(f"disk full: nothing can be compiled in {places}; make room there; {again}") from error
     try:
         picture, report = draw_run(folder, body), write_report([folder], body=body)
     except OSError as error:

@@ -44,7 +44,7 @@ def check_compiler() -> None:
     asked = os.environ.get("CXX")
     if not any(shutil.which(name) for name in ([asked] if asked else ["g++", "clang++", "c++"])):
         raise ValueError(f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or --no-compile")
-    folder = Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or tempfile.gettempdir()).absolute()
+    folder = folder_of_compiled_code()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     noexec = hasattr(os, "ST_NOEXEC") and os.statvfs(there).f_flag & os.ST_NOEXEC
     if noexec or not os.access(there, os.W_OK):
@@ -53,6 +53,11 @@ def check_compiler() -> None:
             f"compiled code is put into {folder} and loaded from there, which {why}; name another folder by the "
             "environment variable TORCHINDUCTOR_CACHE_DIR, or --no-compile"
         )
+
+
+def folder_of_compiled_code() -> Path:
+    """Where Inductor puts what it compiles, or the folder in which it makes one."""
+    return Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or tempfile.gettempdir()).absolute()
 
 
 def prepare(threads: int, device: torch.device) -> bool:

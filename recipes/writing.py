@@ -124,9 +124,14 @@ def telling_full_disk(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        if getattr(error, "errno", None) not in FULL and not has_no_room(path.parent):
+        if not says_full(error) and not has_no_room(path.parent):
             raise
         raise OSError(f"disk full: {path} could not be written; make room on the disk of {path.parent}") from error
+
+
+def says_full(error: Exception) -> bool:
+    """Whether an error says that a disk is full, be it in the words of a compiler."""
+    return getattr(error, "errno", None) in FULL or os.strerror(errno.ENOSPC) in str(error)
 
 
 def has_no_room(folder: Path) -> bool:

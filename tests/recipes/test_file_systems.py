@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from interrupted_runs import resume, run
 
-from coim import HopperMorph, load_run
+from coim import HopperMorph, SACLearner, load_run
 from recipes import report, soak, writing
 from recipes.best_policies import BestPolicies
 from recipes.checkpoint import Checkpoints
@@ -166,6 +166,22 @@ def test_a_run_that_fills_its_disk_says_so_and_how_it_goes_on(
     assert f"make room on the disk of {folder}" in said
     assert f"to go on: python -m recipes.hopper --resume {folder}" in said
     assert "\n" not in said
+    resume(folder)
+    assert soak.differences(whole, folder) == []
+
+
+def test_a_compiler_that_fills_the_disk_says_so_and_how_the_run_goes_on(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compile_on_a_full_disk(*args: object) -> None:
+        raise RuntimeError("C++ compile error\n\nfatal error: cannot write PCH file: No space left on device")
+
+    folder, cache = tmp_path / "run", tmp_path / "cache"
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(cache))
+    with monkeypatch.context() as patched:
+        patched.setattr(SACLearner, "update", compile_on_a_full_disk)
+        with pytest.raises(OSError, match=rf"^disk full: nothing can be compiled in {cache} .* --resume {folder}$"):
+            run(folder)
     resume(folder)
     assert soak.differences(whole, folder) == []
 
