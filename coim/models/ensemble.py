@@ -22,6 +22,7 @@ from torch.nn.functional import softplus
 from torchrl.envs import EnvBase
 
 from coim.angles import wrap_angle
+from coim.calling import called_as
 
 from .bodies import body_of, design_bounds
 from .normaliser import RunningNormaliser
@@ -120,7 +121,8 @@ class GaussianEnsemble(TensorDictModuleBase):
         """Build an ensemble that fits an environment (Sec. 6.1: three members, three hidden layers of 500 units).
 
         Design entries are scaled by at least the standard deviation of a uniform draw within their bounds: after one
-        design, or two near ones, the running statistics alone would magnify any other design beyond all data.
+        design, or two near ones, the running statistics alone would magnify any other design beyond all data. Weights
+        are drawn on the CPU, and then go to the device and dtype of the observations.
 
         Args:
             env: anything with ``observation_spec``, ``action_spec`` and bounds of the design, in the observation's spec
@@ -130,9 +132,6 @@ class GaussianEnsemble(TensorDictModuleBase):
             num_cells: units of each hidden layer.
             predict: ``"delta"`` or ``"next"``.
             num_runs: ``K``, or None for a single run.
-
-        Returns:
-            An ensemble on the device and in the dtype of the observations; its weights are drawn on the CPU.
 
         Raises:
             ValueError: if a transform rewrites observations in which there are angles, or the workers of ``env`` are
@@ -264,6 +263,9 @@ class GaussianEnsemble(TensorDictModuleBase):
 
     def _grouped(self, inputs: Tensor, members: Tensor) -> Tensor:
         """Run each member on its own rows only: ``[*B, (K,) F], [*B, (K)] -> [*B, (K,) 2 S]``."""
+        if not called_as(self.network, StackedMLP):  # it may do more than its layers do
+            every = self.network(inputs)
+            return every.take_along_dim(members[..., None, None], -2).squeeze(-2)
         runs = self.num_runs or 1
         rows = inputs.reshape(-1, runs, inputs.shape[-1])
         groups = members.reshape(-1, runs) + self.num_members * torch.arange(runs, device=members.device)

@@ -133,6 +133,18 @@ def test_sampling_without_gradients_draws_the_same(monkeypatch, make_rows, runs,
     torch.testing.assert_close(sampled, expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("runs", [None, 2])
+@pytest.mark.parametrize("grad", [True, False])
+def test_samples_are_of_the_network_as_it_is_called(make_rows, runs, grad):
+    ensemble, rows = GaussianEnsemble(3, 2, 2, num_cells=(8,), num_runs=runs), make_rows(300, 2, dtype=torch.float32)
+    ensemble.network.register_forward_hook(lambda module, given, out: 2 * out)
+    members = torch.randint(3, (300, 2))
+    with torch.set_grad_enabled(grad):
+        sampled = ensemble.sample(*inputs(rows), members=members, noise=torch.zeros(300, 2, 3))
+        mean = ensemble.moments(*inputs(rows))[0].take_along_dim(members[..., None, None], -2).squeeze(-2)
+    torch.testing.assert_close(sampled, mean)
+
+
 def test_a_sample_has_the_moments_of_its_member(make_rows):
     rows = make_rows(1)
     ensemble, many = ensemble_on(make_rows(50)), make_rows(1).expand(1, 20_000).reshape(-1)
