@@ -82,7 +82,8 @@ def refuse_target(study: Path, target: Path) -> None:
     """Refuse to write over what is more than an archive.
 
     Raises:
-        ValueError: if the target is in the study's own folder, is a study's folder itself, or no folder.
+        ValueError: if the target is in the study's own folder, is a study's folder itself, keeps another study, or is
+            no folder.
     """
     if target.resolve().is_relative_to(study.resolve()):
         raise ValueError(f"{target} is in the study's own folder; name one outside of it")
@@ -90,6 +91,15 @@ def refuse_target(study: Path, target: Path) -> None:
         raise ValueError(f"{target} is a file; name a folder")
     if (target / "logs").exists() or any(target.glob("cells/*/checkpoint")):
         raise ValueError(f"{target} is the folder of a study with checkpoints, no archive; name another one")
+    kept, own = (name_of(folder) for folder in (target, study))
+    if None not in (kept, own) and kept != own:
+        raise ValueError(f"{target} keeps another study, {kept!r}, and this one is {own!r}; name another folder")
+
+
+def name_of(study: Path) -> str | None:
+    """What a study is called in its ``study.json``, if it has one."""
+    path = study / "study.json"
+    return json.loads(path.read_text()).get("name") if path.is_file() else None
 
 
 def runs_in(study: Path) -> list[Path]:

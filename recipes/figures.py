@@ -23,14 +23,16 @@ from recipes.plots import cartpole, design_space, model_error, retrained, return
 from recipes.plots.intervals import FEW
 from recipes.plots.measured import FOLDER
 from recipes.plots.plot import Plot
+from recipes.progress import counted
 from recipes.reporting.page import FONT
 from recipes.reporting.records import number
 from recipes.settings import read_config
-from recipes.writing import as_csv, write_whole, written_aside
+from recipes.writing import as_csv, naming_out, write_whole, written_aside
 
 MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
 OF_MODELS = (model_error, design_space, cartpole)  # what a folder without cells has, Fig. 4
 SUFFIXES = ("png", "pdf", "csv", "md")
+TITLE = "# Figures of "
 RESOLUTION = 150  # dots per inch of a PNG
 
 
@@ -40,47 +42,63 @@ class Figures:
 
     study: tyro.conf.Positional[Path]
     """Folder of the study."""
+    out: Path | None = None
+    """Folder for the figures; by default figures/ in the study's."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     asked = tyro.cli(Figures, prog="python -m recipes.figures", description=__doc__, args=arguments)
     with on_command_line(own_process=arguments is None):
-        for plot in write_figures(asked.study):
-            place = asked.study / "figures" / plot.name
+        for plot in write_figures(asked.study, asked.out):
+            place = (asked.out or asked.study / "figures") / plot.name
             print(f"{place}: {'nothing to draw. ' + plot.caption if plot.figure is None else 'written'}")
 
 
-def write_figures(study: Path) -> list[Plot]:
+def write_figures(study: Path, out: Path | None = None) -> list[Plot]:
     """Write every figure that has something to show.
 
     Args:
         study: its folder.
+        out: folder for the figures; by default ``figures/`` in the study's.
 
     Returns:
         The plots, also those that have no figure because their input is not there.
 
     Raises:
-        ValueError: if the folder is no study's, nor has a measured run.
+        ValueError: if the folder is no study's, nor has a measured run, or that for the figures holds a page of
+            somebody else.
+        OSError: if the figures cannot be written.
     """
-    folder, found = study / "figures", []
+    folder, found = out or study / "figures", []
+    before = drawn_before(folder)
     measured_only = (study / FOLDER).is_dir() and not (study / "cells").is_dir()
-    with mpl.rc_context(FONT):
-        for module in OF_MODELS if measured_only else MODULES:
+    modules = OF_MODELS if measured_only else MODULES
+    with mpl.rc_context(FONT), naming_out(folder):
+        for module in counted(modules, len(modules), "figures: parts"):
             for plot in module.plots(study):
-                folder.mkdir(exist_ok=True)
+                folder.mkdir(parents=True, exist_ok=True)
                 write_plot(folder, plot)
                 found.append(plot)
-    for name in drawn_before(folder) - {plot.name for plot in found}:
-        remove(folder, name)
-    write_whole(folder / "README.md", page(study, found))
+        for name in before - {plot.name for plot in found}:
+            remove(folder, name)
+        write_whole(folder / "README.md", page(study, found))
     return found
 
 
 def drawn_before(folder: Path) -> set[str]:
-    """Names of the plots of an earlier drawing, which may have been called otherwise: by its page."""
-    page = folder / "README.md"
-    return set(re.findall(r"^## (\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)) if page.is_file() else set()
+    """Names of the plots of an earlier drawing, which may have been called otherwise: by its page.
+
+    Raises:
+        ValueError: if the page that is there is no page of figures.
+    """
+    path = folder / "README.md"
+    if not path.is_file():
+        return set()
+    there = path.read_text(encoding="utf-8")
+    if not there.startswith(TITLE):
+        raise ValueError(f"{path} is no page of figures and would be written over; name another folder with --out")
+    return set(re.findall(r"^## (\w+)$", there, re.MULTILINE))
 
 
 def remove(folder: Path, name: str) -> None:
@@ -107,7 +125,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
 
 def page(study: Path, plots: Iterable[Plot]) -> str:
     """All figures with their captions, in Markdown."""
-    lines = [f"# Figures of {study.resolve().name}", "", f"Written by `python -m recipes.figures`. {FEW}", ""]
+    lines = [f"{TITLE}{study.resolve().name}", "", f"Written by `python -m recipes.figures`. {FEW}", ""]
     lines += [made_by(study), ""] if (study / "cells").is_dir() else []
     for plot in plots:
         lines += [f"## {plot.name}", ""]

@@ -12,7 +12,7 @@ from recipes.figures import write_figures
 from recipes.plots.runs import read_runs
 from recipes.settings import plain
 from recipes.studies.conduct import Resources, take_up
-from recipes.studies.definition import Study
+from recipes.studies.definition import Study, to_json
 from recipes.studies.ledger import Ledger
 from tests.recipes.made_up_study import read_table, write_cell, write_table
 
@@ -137,10 +137,14 @@ def test_what_cannot_be_kept_is_told(study: Path, tmp_path: Path) -> None:
     (other / "cells" / "hopper-forward-none-0" / "checkpoint").mkdir()
     before = {path: path.read_bytes() for path in other.rglob("*.csv")}
     (tmp_path / "file").touch()
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "study.json").write_text('{"name": "theirs"}')
+    (study / "study.json").write_text(to_json(STUDY))
     for where, target, sentence in (
         (tmp_path, tmp_path / "kept", "is no study's folder: it has no cells/"),
         (study, study / "kept", "is in the study's own folder"),
         (study, other, "is the folder of a study with checkpoints, no archive"),
+        (study, tmp_path / "theirs", f"keeps another study, 'theirs', and this one is {STUDY.name!r}"),
         (study, study / ".." / "file", "is a file; name a folder"),
     ):
         with pytest.raises(SystemExit, match=sentence):

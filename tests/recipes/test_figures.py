@@ -30,6 +30,27 @@ def study(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_figures_of_a_study_that_is_not_ours_go_where_out_says_and_over_nothing_of_others(
+    study: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recipes.figures.MODULES", (statistics,))
+    out = tmp_path_factory.mktemp("mine")
+    (out / "README.md").write_text("# Mine")
+    with pytest.raises(SystemExit, match=r"README.md is no page of figures .* with --out"):
+        main([str(study), "--out", str(out)])
+    assert (out / "README.md").read_text() == "# Mine"
+    main([str(study), "--out", str(out / "figures")])
+    assert (out / "figures" / "statistics_arms.png").is_file()
+    assert not (study / "figures").exists()
+
+    def refuse(folder: Path, plot: Plot) -> None:
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("recipes.figures.write_plot", refuse)
+    with pytest.raises(SystemExit, match=r"figures cannot be written to \(Permission denied\); .* with --out"):
+        main([str(study)])
+
+
 def test_every_figure_has_its_three_files_and_a_place_on_the_page(study: Path, capsys: pytest.CaptureFixture) -> None:
     main([str(study)])
     folder, said = study / "figures", capsys.readouterr().out
