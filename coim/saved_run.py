@@ -241,7 +241,11 @@ def read_designs(folder: Path) -> tuple[TriedDesign, ...]:
             run=row["run"],
             number=row["design"],
             kind=row["kind"],
-            design=torch.tensor([cell for name, cell in row.items() if name.startswith(DESIGN_PREFIX)]),
+            design=torch.tensor(
+                [cell for name, cell in row.items() if name.startswith(DESIGN_PREFIX)],
+                dtype=torch.float32,
+                device="cpu",
+            ),
             predicted=row["predicted"],
             best_return=row["best_return"],
             diverged=row.get("diverged", ""),

@@ -78,6 +78,19 @@ def test_the_best_evaluation_of_every_design_can_be_played_again(fleet: Made) ->
         assert torch.allclose(played["design"][0], torch.stack([design.design for design in tried]), rtol=1e-6)
 
 
+def test_a_run_is_opened_as_it_was_whatever_torchs_default_dtype(fleet: Made) -> None:
+    expected = load_run(fleet[0])
+    torch.set_default_dtype(torch.float64)
+    try:
+        loaded = load_run(fleet[0])
+        assert torch.equal(loaded.best_episode(1)["action"], expected.best_episode(1)["action"])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert equal(loaded.population.policy, expected.population.policy)
+    assert all(torch.equal(one.design, other.design) for one, other in zip(loaded.designs, expected.designs))
+    assert loaded.designs[0].design.dtype == torch.float32
+
+
 def test_a_design_keeps_its_best_policy_and_not_its_last(fleet: Made) -> None:
     folder, algorithm = fleet
     best, last = load_run(folder).policy_of(6), algorithm.individual.policy
