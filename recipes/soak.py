@@ -111,8 +111,10 @@ def killed_and_resumed(folder: Path, settings: Settings, *moments: float) -> int
     last = 0
     for moment in moments:
         process = start(folder, settings)
-        process.join(moment)
-        process.kill()
+        try:
+            process.join(moment)
+        finally:
+            process.kill()
         process.join()
         last = max([0, *(int(path.name.split("-")[1]) for path in folder.glob("checkpoint/checkpoint-*"))])
     finish(start(folder, settings))
@@ -131,6 +133,7 @@ def start(folder: Path, settings: Settings) -> BaseProcess:
 
 def make_or_resume(folder: Path, settings: Settings) -> None:
     """Go on with a run as its user would, or start it if nothing but its folder was made."""
+    os.setsid()  # Ctrl-C at a terminal is meant for its parent, which kills it
     if (folder / "config.json").exists():
         main_of_recipe(HopperMorph, "hopper", ["--resume", str(folder)])
     else:
@@ -138,8 +141,12 @@ def make_or_resume(folder: Path, settings: Settings) -> None:
 
 
 def finish(process: BaseProcess) -> None:
-    """Wait for a process to end well."""
-    process.join()
+    """Wait for a process to end well; it is killed if this one is told to end."""
+    try:
+        process.join()
+    except KeyboardInterrupt:
+        process.kill()
+        raise
     if process.exitcode:
         raise RuntimeError(f"the run ended with exit code {process.exitcode}; its last words are above")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -45,6 +46,13 @@ def test_no_command_writes_over_the_results_that_are_kept(
     assert "known designs: a run in peace" in capsys.readouterr().out
     for out in (Curve().out, Training().out):
         assert out.parent == Path("runs")
+
+
+def test_a_soak_that_is_told_to_end_takes_its_run_with_it() -> None:
+    process = Mock(join=Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        soak.finish(process)
+    process.kill.assert_called_once_with()
 
 
 def test_what_differs_is_named() -> None:
