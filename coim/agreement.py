@@ -9,30 +9,45 @@ Shapes: K runs, I first designs, N rows that are tried, D design, S observation,
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
+from numbers import Integral
 
 import torch
 from torch import Tensor
 from torchrl.data import Bounded
 
+from coim.buffers import Buffers
 from coim.designs import DesignGenerator, DesignSearch
 from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
+from coim.envs.simulator_dream import SimulatorDynamics
 from coim.envs.world_model import WorldModelEnv
 from coim.learner import SACLearner
 from coim.models.ensemble import GaussianEnsemble
+from coim.written_out import check_exchangeable
 
 PRECISIONS = ("float32", "bfloat16")
 TRIES = 16  # draws of G from each design that is tried
 
 
 def check_counts(counts: Mapping[str, int], updates: Mapping[str, int]) -> None:
-    """Refuse counts below 1 and updates below 0, by their names."""
+    """Refuse what is no whole number, counts below 1 and updates below 0, by their names."""
+    for name, count in {**counts, **updates}.items():
+        if isinstance(count, bool) or not isinstance(count, Integral):
+            raise ValueError(f"{name} is {count!r}, it must be a whole number")
     for name, count in counts.items():
         if count < 1:
             raise ValueError(f"{name} is {count}, it must be at least 1")
     for name, count in updates.items():
         if count < 0:
             raise ValueError(f"{name} is {count}, it must be at least 0 (0 does not train)")
+
+
+def check_kinds(parts: Mapping[str, tuple[object, type]]) -> None:
+    """Refuse a part, by its name, that is something else than what it must be."""
+    for name, (part, kind) in parts.items():
+        if not isinstance(part, kind):
+            raise TypeError(f"{name} is a {type(part).__name__}; pass a {kind.__name__}")
 
 
 def check_precision(precision: str) -> None:
@@ -115,6 +130,76 @@ def check_learners(
     return device
 
 
+def check_networks(
+    env: MorphEnv, population: SACLearner, individual: SACLearner, dynamics: DynamicsLearner | None
+) -> None:
+    """Refuse networks that do not fit the bodies, and those of two learners that cannot start from each other."""
+    sizes, wanted = _sizes(env), env.observation_spec["observation"].dtype
+    state, body = sizes["observation"], sizes["design"]
+    for name, learner in (("population", population), ("individual", individual)):
+        policy, qvalue = learner.policy.network.mlp, learner.qvalue.module.mlp
+        found = policy.in_features, policy.out_features, qvalue.in_features
+        if found != (state + body, 2 * sizes["action"], sum(sizes.values())):
+            raise ValueError(
+                f"the networks of {name} are not for bodies of sizes {sizes}: the policy turns {found[0]} numbers into "
+                f"{found[1]}, the critics read {found[2]}; make them with make_policy(env) and make_qvalue(env)"
+            )
+    for name, trained in {"population": population, "individual": individual, "dynamics": dynamics}.items():
+        if trained is not None and (dtype := trained.weights_by_run()[0].dtype) != wanted:
+            raise ValueError(f"the weights of {name} are {dtype}, the bodies observe in {wanted}; leave them in that")
+    check_exchangeable((individual.policy, individual.qvalue), (population.policy, population.qvalue))
+    if dynamics is not None:
+        _check_model(env, dynamics.ensemble)
+
+
+def check_buffers(env: MorphEnv, buffers: Buffers, *, imagined_rows: int) -> None:
+    """Refuse buffers that are one, are for other runs, live apart, or are too small for what is stored at once."""
+    parts = {field.name: getattr(buffers, field.name) for field in fields(buffers)}
+    if len({id(buffer) for buffer in parts.values()}) < len(parts):
+        raise ValueError(
+            "two of the buffers are one, and emptying one would empty the other; make four, with Buffers.for_env(env)"
+        )
+    runs, device = env.batch_size.numel(), buffers.pop.storage.device
+    least = {"pop": env.episode_steps, "ind": env.episode_steps, "s0": 1, "art": imagined_rows}
+    for name, buffer in parts.items():
+        if buffer.num_runs != runs:
+            raise ValueError(f"buffer {name} is for {buffer.num_runs} run(s), the bodies have {runs}; make it for them")
+        if buffer.capacity < least[name]:
+            raise ValueError(
+                f"buffer {name} has room for {buffer.capacity} rows, and {least[name]} come at once; enlarge it"
+            )
+        if buffer.storage.device != device:
+            raise ValueError(
+                f"buffer pop is on {device}, {name} on {buffer.storage.device}; make all buffers on one device"
+            )
+
+
+def _sizes(env: MorphEnv | WorldModelEnv) -> dict[str, int]:
+    return {
+        "observation": env.observation_spec["observation"].shape[-1],
+        "action": env.action_spec.shape[-1],
+        "design": env.design_spec.shape[-1],
+    }
+
+
+def _check_model(env: MorphEnv, model: object) -> None:
+    """Refuse a model of other bodies, or of other runs; one that is not known here is believed."""
+    if isinstance(model, SimulatorDynamics) and type(model.bodies) is not type(env):
+        raise ValueError(
+            f"the dream simulates a {type(model.bodies).__name__}, the bodies are of {type(env).__name__}; simulate "
+            "those"
+        )
+    if not isinstance(model, GaussianEnsemble):
+        return
+    sizes, runs, network = _sizes(env), env.batch_size.numel(), model.network
+    found = network.in_features, network.out_features, model.num_runs or 1
+    if found != (sum(sizes.values()), 2 * sizes["observation"], runs):
+        raise ValueError(
+            f"the ensemble is not for {runs} run(s) of bodies of sizes {sizes}: it has {found[2]} and turns {found[0]} "
+            f"numbers into {found[1]}; make it with GaussianEnsemble.for_env(env)"
+        )
+
+
 def check_dream(
     env: MorphEnv,
     dynamics: DynamicsLearner | None,
@@ -143,19 +228,13 @@ def check_dream(
                 "the dream steps an ensemble that has seen nothing and that nobody trains; give its learner as dynamics"
             )
     _check_rewards(env, dream)
+    _check_model(env, model)
     _check_generator(env, generator, first_designs)
 
 
 def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:
     """Compare the rewards of dream and bodies on a few rows that stand for all."""
-    sizes = [
-        {
-            "observation": made.observation_spec["observation"].shape[-1],
-            "action": made.action_spec.shape[-1],
-            "design": made.design_spec.shape[-1],
-        }
-        for made in (env, dream)
-    ]
+    sizes = _sizes(env), _sizes(dream)
     if sizes[0] != sizes[1]:
         raise ValueError(f"the dream has sizes {sizes[1]}, the bodies {sizes[0]}; make the dream of these bodies")
     rng = torch.Generator("cpu").manual_seed(0)
@@ -172,14 +251,21 @@ def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:
 
 def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: Tensor) -> None:
     """Try G on the first designs and on two corners; torch's global generators stay as they are."""
+    if not callable(generator):
+        raise TypeError(f"the generator is a {type(generator).__name__}; pass a DesignGenerator, such as NoisyDesigns")
     low, high = env.design_spec.space.low, env.design_spec.space.high
     tried = torch.cat([first_designs, low[None], high[None]]).repeat(TRIES, 1)
     tried = tried.unsqueeze(1).expand(-1, env.batch_size.numel(), -1)  # [N, K, D]
     with torch.random.fork_rng(devices=[tried.device] if tried.device.type == "cuda" else []):
-        found = generator(tried, rng=torch.Generator(tried.device).manual_seed(0))
+        found = generator(tried.clone(), rng=torch.Generator(tried.device).manual_seed(0))
     if found.shape != tried.shape:
         raise ValueError(
             f"the generator makes designs {list(found.shape)} of designs {list(tried.shape)}; it must keep their shape"
+        )
+    if found.dtype != tried.dtype or found.device != tried.device:
+        raise ValueError(
+            f"the generator makes designs in {found.dtype} on {found.device}, of designs in {tried.dtype} on "
+            f"{tried.device}; it must keep both"
         )
     outside = ~((low <= found) & (found <= high)).all(-1)  # NaN is neither
     if outside.any():
@@ -191,6 +277,9 @@ def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: T
 
 def check_search(env: MorphEnv, search: DesignSearch) -> None:
     """Refuse a search among designs that these bodies cannot have; one that does not say where it looks is believed."""
+    if isinstance(search, type) or not callable(getattr(search, "maximise", None)):
+        what = f"the class {search.__name__}" if isinstance(search, type) else f"a {type(search).__name__}"
+        raise TypeError(f"search is {what}; pass a DesignSearch, such as ParticleSwarm(env.design_spec, seed=0)")
     spec: Bounded | None = getattr(search, "spec", None)
     if spec is None:
         return

@@ -25,10 +25,13 @@ from torch import Tensor
 
 from coim.agreement import (
     check_bodies,
+    check_buffers,
     check_counts,
     check_dream,
     check_first_designs,
+    check_kinds,
     check_learners,
+    check_networks,
     check_precision,
     check_search,
 )
@@ -98,12 +101,14 @@ class CoAdaptation:
             are drawn on the CPU wherever the networks are: there the same seed gives the same first episode.
 
     Raises:
-        ValueError: if a count is below its least value, a share outside [0, 1] or of less than a row, ``bodies`` or
-            ``precision`` is unknown, or the parts do not agree (see `coim.agreement`): two environments or learners
-            are one, evaluation is of another body or task, networks lack the runs of the bodies, the dream steps
-            another ensemble than the one that learns or pays other rewards, G or the search leaves the bounds, first
-            designs have the wrong shape, dtype or device, or learners that are not on the CPU shall go side by side.
-        TypeError: if an environment or the dream is behind transforms.
+        ValueError: if a count is no whole number or below its least value, a share outside [0, 1] or of less than a
+            row, ``bodies`` or ``precision`` is unknown, or the parts do not agree (see `coim.agreement`): two
+            environments or learners are one, evaluation is of another body or task, networks lack the runs of the
+            bodies or have other sizes, the two learners' networks or their scalings differ, buffers are too small or
+            for other runs, the dream steps another ensemble than the one that learns or pays other rewards, G or the
+            search leaves the bounds, first designs have the wrong shape, dtype or device, or learners that are not on
+            the CPU shall go side by side.
+        TypeError: if an environment or the dream is behind transforms, or a part is no such thing at all.
 
     Note:
         Whoever stops at an event may come back to it: iterating again goes on with what comes next, and so does another
@@ -155,9 +160,18 @@ class CoAdaptation:
         check_counts(counts, {f"{name}_updates": count for name, count in updates.items()})
         check_precision(precision)
         check_bodies(env, evaluation_env)
+        kinds: dict[str, tuple[object, type]] = {
+            "population": (population, SACLearner),
+            "individual": (individual, SACLearner),
+            "buffers": (buffers, Buffers),
+            "first_designs": (first_designs, Tensor),
+        }
+        check_kinds(kinds if dynamics is None else kinds | {"dynamics": (dynamics, DynamicsLearner)})
         check_first_designs(env, first_designs)
-        check_search(env, search)
+        if bodies == "search" or search is not None:
+            check_search(env, search)
         self.device = check_learners(env, population, individual, dynamics, side_by_side=side_by_side)
+        check_networks(env, population, individual, dynamics)
         check_dream(env, dynamics, dream, generator, first_designs)
         self.env, self.evaluation_env = env, evaluation_env
         self.population, self.individual, self.dynamics = population, individual, dynamics
@@ -175,6 +189,7 @@ class CoAdaptation:
         )
         self.batch_size, self.num_start_states = batch_size, num_start_states
         self.imagined_rows = self._rows_to_draw()
+        check_buffers(env, buffers, imagined_rows=self.imagined_rows if imagines else 1)
         self.index, self.env_steps = 0, 0
         self.trial: Trial | None = None  # the body that is being tried
         self.rngs = self._generators(seed)

@@ -31,7 +31,7 @@ from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradient
 from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
-from coim.written_out import check_sac_networks, check_sac_rows
+from coim.written_out import check_exchangeable, check_sac_networks, check_sac_rows
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -60,7 +60,7 @@ class SACLearner:
 
     Raises:
         ValueError: if ``precision`` is unknown, a number is out of its range, ``num_runs`` is not the networks', or
-            policy and critics scale their inputs differently.
+            policy and critics scale their inputs differently or have not one device and dtype.
         TypeError: if a network computes anything else than those of `coim.models` do, such as another activation.
 
     Note:
@@ -117,7 +117,12 @@ class SACLearner:
 
     @torch.no_grad()
     def start_from(self, other: SACLearner) -> None:
-        """Take the other learner's weights, targets included, with an optimiser that has seen nothing (Algorithm 1)."""
+        """Take the other learner's weights, targets included, with an optimiser that has seen nothing (Algorithm 1).
+
+        Raises:
+            ValueError: if that one's networks have other sizes or scale their inputs differently.
+        """
+        check_exchangeable((self.policy, self.qvalue), (other.policy, other.qvalue))
         self._weights.copy_(other._weights)
         self._targets.copy_(other._targets)
         # In place: a captured CUDA graph goes on writing to these very moments.

@@ -32,7 +32,7 @@ def check_sac_networks(policy: Policy, qvalue: QValue) -> None:
 
     Raises:
         TypeError: naming the part that is another, or a weight that must not be trained.
-        ValueError: if the two scale their inputs differently.
+        ValueError: if the two scale their inputs differently, or are on other devices or in other dtypes.
     """
     for network in (policy, qvalue):
         _check_parts(network, OF_SAC, "SACLearner", "CoImSACLoss")
@@ -42,8 +42,33 @@ def check_sac_networks(policy: Policy, qvalue: QValue) -> None:
             f"SACLearner knows the gradients of a TanhNormal on [-1, 1], not of {distribution.__name__} with "
             f"{settings}; train it with CoImSACLoss and an optimiser"
         )
+    kinds = {(weights.device, weights.dtype) for network in (policy, qvalue) for weights in network.parameters()}
+    if len(kinds) > 1:
+        found = " and ".join(sorted(f"{dtype} on {device}" for device, dtype in kinds))
+        raise ValueError(f"the weights of policy and qvalue are {found}; move both to one device and dtype first")
     if not _same_scaling(policy.network.scaling, qvalue.module.scaling):
         raise ValueError("policy and qvalue scale their inputs differently; make both for the same environment")
+
+
+def check_exchangeable(own: tuple[Policy, QValue], others: tuple[Policy, QValue]) -> None:
+    """Refuse two learners of which one cannot take the weights of the other, or would mean something else by them.
+
+    Raises:
+        ValueError: if their layers or their scalings differ.
+    """
+    pairs: list[tuple[nn.Module, nn.Module]] = list(zip(own, others, strict=True))
+    for network, other in pairs:
+        layers, theirs = ([list(weights.shape) for weights in module.parameters()] for module in (network, other))
+        if layers != theirs:
+            raise ValueError(
+                f"the {type(network).__name__} of one learner has weights of shapes {layers}, that of the other "
+                f"{theirs}; make both with the same sizes, so that one can start from the other"
+            )
+    if not _same_scaling(own[0].network.scaling, others[0].network.scaling):
+        raise ValueError(
+            "the two learners scale their inputs differently, and weights of one mean something else in the other; "
+            "make both for the same environment"
+        )
 
 
 def check_sac_rows(rows: TensorDictBase, keys: CoImSACLoss._AcceptedKeys) -> None:

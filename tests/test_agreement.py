@@ -24,6 +24,7 @@ from coim import (
     KnownDesigns,
     ParticleSwarm,
     SACLearner,
+    SimulatorDynamics,
     WalkerMorph,
     WorldModelEnv,
     make_policy,
@@ -32,6 +33,7 @@ from coim import (
 from coim.agreement import check_dream, check_learners
 
 ENV = HopperMorph(num_runs=2, episode_steps=STEPS, seed=0)
+WALKER = WalkerMorph(num_runs=2, seed=0)
 
 
 def learner(num_runs: int | None = 2) -> SACLearner:
@@ -47,9 +49,9 @@ def sharing(name: str) -> dict[str, SACLearner]:
     return {"population": other, "individual": SACLearner(*both.values(), num_runs=2)}
 
 
-def ensemble(num_runs: int | None = 2) -> GaussianEnsemble:
-    """A tiny one for hoppers."""
-    return GaussianEnsemble.for_env(ENV, num_cells=(4,), num_runs=num_runs)
+def ensemble(num_runs: int | None = 2, *, env: HopperMorph | WalkerMorph = ENV) -> GaussianEnsemble:
+    """A tiny one, for hoppers unless said otherwise."""
+    return GaussianEnsemble.for_env(env, num_cells=(4,), num_runs=num_runs)
 
 
 def dreaming(**parts: Any) -> dict[str, Any]:
@@ -65,7 +67,7 @@ def algorithm(**parts: Any) -> CoAdaptation:
         "evaluation_env": HopperMorph(num_runs=2, episode_steps=STEPS, seed=1),
         "population": learner(),
         "individual": learner(),
-        "buffers": Buffers.for_env(ENV, pop_capacity=90, ind_capacity=90, s0_capacity=9, art_capacity=90, seed=0),
+        "buffers": buffers(),
         "search": GradientSearch(ENV.design_spec, num_starts=2, num_steps=2, seed=0),
         "first_designs": torch.ones(1, 4),
         "individual_updates": 2,
@@ -99,9 +101,39 @@ def dream_of(**settings: Any) -> dict[str, Any]:
 
 def walking_dream() -> dict[str, Any]:
     """A dream of another body, sizes and all."""
-    walker = WalkerMorph(num_runs=2, seed=0)
-    learnt = GaussianEnsemble.for_env(walker, num_cells=(4,), num_runs=2)
-    return dreaming(dynamics=DynamicsLearner(learnt, num_runs=2), dream=WorldModelEnv(learnt, walker, batch_size=[2]))
+    parts = dreaming()
+    return parts | {"dream": WorldModelEnv(parts["dynamics"].ensemble, WALKER, batch_size=[2])}
+
+
+def sized(num_cells: int = 4, *, env: HopperMorph | WalkerMorph = ENV, scaled: bool = True) -> SACLearner:
+    """A learner with other layers, for other bodies, or without scaling."""
+    policy, qvalue = (make(env, num_cells=(num_cells,), num_runs=2) for make in (make_policy, make_qvalue))
+    if not scaled:
+        policy.network.scaling = qvalue.module.scaling = None
+    return SACLearner(policy, qvalue, num_runs=2)
+
+
+def double() -> SACLearner:
+    """A learner in float64."""
+    policy, qvalue = (make(ENV, num_cells=(4,), num_runs=2).double() for make in (make_policy, make_qvalue))
+    return SACLearner(policy, qvalue, num_runs=2)
+
+
+def buffers(*, num_runs: int = 2, **capacities: int) -> Buffers:
+    """Buffers in which all but some capacities suffice."""
+    capacity = {"pop_capacity": 90, "ind_capacity": 90, "s0_capacity": 9, "art_capacity": 102} | capacities
+    return Buffers.for_env(HopperMorph(num_runs=num_runs, seed=0), **capacity, seed=0)
+
+
+def one_for_two() -> Buffers:
+    """Replay_Ind is Replay_Pop, which every new design would empty."""
+    made = buffers()
+    return Buffers(pop=made.pop, ind=made.pop, s0=made.s0, art=made.art)
+
+
+def simulated_dream(bodies: type[HopperMorph] | type[WalkerMorph]) -> dict[str, Any]:
+    """The simulator imagines."""
+    return dreaming(dream=WorldModelEnv(SimulatorDynamics(bodies(num_runs=2, seed=0)), ENV, batch_size=[2]))
 
 
 def one_for_both() -> dict[str, SACLearner]:
@@ -135,6 +167,43 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
     "a model without run axis": (
         lambda: dreaming(dynamics=DynamicsLearner(ensemble(None))),
         "dynamics has num_runs=None",
+    ),
+    "learners for another body": (
+        lambda: {name: sized(env=WALKER) for name in ("population", "individual")},
+        r"the networks of population are not for bodies of sizes .*: the policy turns 25 numbers into 12, the critics",
+    ),
+    "learners in double": (
+        lambda: {"population": double(), "individual": double()},
+        "the weights of population are torch.float64, the bodies observe in torch.float32",
+    ),
+    "learners of two sizes": (lambda: {"individual": sized(5)}, "the Policy of one learner has weights of shapes"),
+    "learners that scale otherwise": (
+        lambda: {"individual": sized(scaled=False)},
+        "the two learners scale their inputs differently",
+    ),
+    "a model of another body": (
+        lambda: {"dynamics": DynamicsLearner(ensemble(env=WALKER), num_runs=2)},
+        "the ensemble is not for 2 .* of bodies of sizes .*: it has 2 and turns 31 numbers into 36",
+    ),
+    "a simulated dream of another body": (
+        lambda: simulated_dream(WalkerMorph),
+        "the dream simulates a WalkerMorph, the bodies are of HopperMorph",
+    ),
+    "one buffer for two": (lambda: {"buffers": one_for_two()}, "two of the buffers are one"),
+    "buffers for other runs": (lambda: {"buffers": buffers(num_runs=3)}, r"buffer pop is for 3 run\(s\), .* have 2"),
+    "less than an episode": (
+        lambda: {"buffers": buffers(ind_capacity=STEPS - 1)},
+        f"buffer ind has room for {STEPS - 1} rows, and {STEPS} come at once",
+    ),
+    "no room for what is imagined": (
+        lambda: dreaming(buffers=buffers(art_capacity=101)),
+        "buffer art has room for 101 rows, and 102 come at once",  # 2 updates with 51 imagined rows of 256
+    ),
+    "half an update": (lambda: {"model_updates": 0.5}, "model_updates is 0.5, it must be a whole number"),
+    "NaN designs": (lambda: {"num_designs": float("nan")}, "num_designs is nan, it must be a whole number"),
+    "G in double": (
+        lambda: dreaming(generator=lambda design, rng=None: design.double()),
+        "makes designs in torch.float64 on cpu, of designs in torch.float32",
     ),
     "no dream": (lambda: {"generator": KnownDesigns()}, "needs both a dream and a generator"),
     "a dream that nobody trains": (
@@ -182,6 +251,22 @@ def test_what_is_behind_transforms_is_refused() -> None:
     parts = dreaming()
     with pytest.raises(TypeError, match=r"the dream is a TransformedEnv, .* pass a WorldModelEnv"):
         algorithm(**parts | {"dream": behind(parts["dream"])})
+
+
+def test_what_is_no_such_part_is_refused() -> None:
+    for part, other in (("population", "a learner"), ("individual", None), ("buffers", {}), ("first_designs", [[1.0]])):
+        with pytest.raises(TypeError, match=f"{part} is a {type(other).__name__}; pass a "):
+            algorithm(**{part: other})
+    for search, what in ((None, "a NoneType"), (ParticleSwarm, "the class ParticleSwarm")):
+        with pytest.raises(TypeError, match=f"search is {what}; pass a DesignSearch"):
+            algorithm(search=search)
+    with pytest.raises(TypeError, match="the generator is a int; pass a DesignGenerator"):
+        algorithm(**dreaming(generator=3))
+    algorithm(search=None, bodies="random")
+
+
+def test_the_simulator_of_the_same_body_may_imagine() -> None:
+    algorithm(**simulated_dream(HopperMorph))
 
 
 def test_a_search_within_narrower_bounds_and_one_that_says_nothing_are_taken() -> None:
