@@ -64,7 +64,7 @@ class Forecast:
     Args:
         left: work that is left.
         goes_on: whether other processes did the beginning of the run.
-        quick: the work of ``--preset quick``, if that is worth a word.
+        quick: the work of ``--preset quick``, if that is worth a word; it is told where it takes less.
         clock: seconds.
     """
 
@@ -117,9 +117,10 @@ class Forecast:
         each = f"{episode:.2g} s an episode" if episode < 10 else f"{episode:.0f} s an episode"
         if self._goes_on:
             return f"about {in_words(left)} left on this machine, {each}"
-        told = f"this run takes about {in_words(self._clock() - self._started + left)} on this machine, {each}"
-        if self._quick is not None:
-            told += f"; --preset quick: about {in_words(self._quick_seconds(self._quick, episode))}"
+        whole = self._clock() - self._started + left
+        told = f"this run takes about {in_words(whole)} on this machine, {each}"
+        if self._quick is not None and (quick := self._quick_seconds(self._quick, episode)) < whole:
+            told += f"; --preset quick: about {in_words(quick)}"
         return told
 
     def _quick_seconds(self, quick: Work, episode: float) -> float:

@@ -38,7 +38,7 @@ class Results:
 
     Raises:
         FileExistsError: if the folder of a new run already holds anything; nothing in it is touched.
-        ValueError: if a CSV file has fewer rows than there were at the checkpoint.
+        ValueError: if a CSV file has fewer rows than there were at the checkpoint, or one that cannot be read.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class Results:
         else:
             note_resumption(folder, settings)
         xi = design_columns(design_names)
-        self._evaluations = Table(
-            folder / "evaluations.csv",
+        self._evaluations = self._table(
+            "evaluations.csv",
             [
                 "run",
                 "design",
@@ -78,13 +78,20 @@ class Results:
             ],
             keep=rows.get("evaluations"),
         )
-        self._designs = Table(
-            folder / "designs.csv",
+        self._designs = self._table(
+            "designs.csv",
             ["run", "design", "kind", *xi, "predicted", "best_return", "diverged"],
             keep=rows.get("designs"),
         )
         self._metrics: Table | None = None  # its columns are known when the first episode is done
         self._metrics_rows = rows.get("metrics", 0)
+
+    def _table(self, name: str, columns: list[str], keep: int | None) -> Table:
+        """One of the files; the rows that it keeps are read at once, as they will be when the run is over."""
+        table = Table(self.folder / name, columns, keep=keep)
+        if keep:
+            read_cells(table.path, OF_RUN[name])
+        return table
 
     def write(self, event: DesignChosen | EpisodeDone | DesignDone, seconds: float) -> None:
         """Append the rows of one event; ``seconds`` is the wall-clock since this process took the run up."""
@@ -130,7 +137,7 @@ class Results:
         parts = sorted(event.seconds)  # learners side by side book theirs in the order in which they end
         if self._metrics is None:
             columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in parts), "diverged"]
-            self._metrics = Table(self.folder / "metrics.csv", columns, keep=self._metrics_rows or None)
+            self._metrics = self._table("metrics.csv", columns, keep=self._metrics_rows or None)
         seconds = [event.seconds[part] for part in parts]
         self._metrics.append(
             [

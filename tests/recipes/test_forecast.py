@@ -83,6 +83,14 @@ def test_the_sentence_is_said_once_and_names_the_quick_preset() -> None:
     assert told[2] == "this run takes about 25 h on this machine, 14 s an episode; --preset quick: about 4 min"
 
 
+def test_a_run_of_many_short_episodes_is_not_advised_to_take_the_quick_preset() -> None:
+    clock = Clock()
+    forecast = Forecast(Work(200, 0, 4), quick=Work(32, 2, 560), clock=clock)
+    told = after(forecast, clock, *[(EPISODE, 0.1)] * 3).sentence
+    # Quick has fewer episodes, with 140 times as many updates after each.
+    assert told == "this run takes about 20 s on this machine, 0.1 s an episode"
+
+
 def test_a_run_that_goes_on_says_what_is_left_and_one_that_is_over_first_says_nothing() -> None:
     clock = Clock()
     forecast = Forecast(Work(3603, 0, 1500), goes_on=True, clock=clock)

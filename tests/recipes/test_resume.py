@@ -57,6 +57,16 @@ def test_what_would_change_the_past_is_refused_by_name(tmp_path: Path, options: 
         resume(folder, *options)
 
 
+def test_a_table_that_cannot_be_read_at_the_end_is_refused_at_the_start(tmp_path: Path) -> None:
+    folder = cut(tmp_path / "cut", 6)
+    table = folder / "designs.csv"
+    table.write_text(table.read_text().replace(",first,1,", ",first,abc,"))
+    with pytest.raises(SystemExit, match=r"designs\.csv, line 2: found 'abc' in column xi_torso, expected a number"):
+        resume(folder)
+    assert not (folder / "report.html").exists()
+    assert len((folder / "evaluations.csv").read_text().splitlines()) == 1 + 4
+
+
 def test_what_is_no_run_of_this_environment_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="holds no run"):
         resume(tmp_path)
