@@ -26,7 +26,7 @@ from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
 from coim.objectives.dynamics import EnsembleNLLLoss, check_one_step
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Network
-from coim.objectives.runs import by_update, check_batch
+from coim.objectives.runs import by_update, check_batch, check_runs_last
 from coim.written_out import check_ensemble
 
 
@@ -92,7 +92,8 @@ class DynamicsLearner:
             rows: ``[*B, (K)]`` on any device, each row once in its life.
 
         Raises:
-            ValueError: if there are no rows, the run axis is missing, or a next observation is several steps ahead.
+            ValueError: if there are no rows, the run axis is missing or not the last, or a next observation is several
+                steps ahead.
         """
         self.ensemble.update_statistics(self._taken(rows))
 
@@ -171,6 +172,7 @@ class DynamicsLearner:
     def _taken(self, rows: TensorDictBase) -> TensorDictBase:
         """Rows on the device of the ensemble, after they were found to be what it learns from."""
         check_batch(rows.batch_size, self.num_runs)
+        check_runs_last(rows, self.num_runs)
         check_one_step(rows, self.loss.tensor_keys.steps_to_next_obs)
         return on_device(rows, self._weights.device)
 

@@ -121,4 +121,4 @@ def _same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
     """Whether two networks see the same numbers."""
     if one is None or other is None:
         return one is other
-    return all(torch.equal(a, b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
+    return all(torch.equal(a.to(b), b) for a, b in zip(one.buffers(), other.buffers(), strict=True))

@@ -220,6 +220,14 @@ def test_networks_that_were_moved_are_not_trained_in_silence(make_rows: Rows, wh
         learner.update(make_rows(1, 4))
 
 
+def test_networks_of_two_dtypes_are_no_learner() -> None:
+    policy, qvalue = make_policy(ToyEnv(), num_cells=(8,)), make_qvalue(ToyEnv(), num_cells=(8,)).double()
+    with pytest.raises(ValueError, match=r"qvalue are torch\.float32 on cpu and torch\.float64 on cpu; move"):
+        SACLearner(policy, qvalue)
+    with pytest.raises(ValueError, match=r"qvalue are torch\.float32 on cpu and torch\.float32 on meta; move"):
+        SACLearner(policy, qvalue.float().to("meta"))
+
+
 def test_the_input_is_left_untouched(make_rows: Rows) -> None:
     batches = make_rows(2, 8)
     before = batches.clone()
@@ -244,6 +252,19 @@ def test_start_from_copies_weights_and_targets_and_forgets_the_moments(make_rows
     torch.testing.assert_close(moved[moved > 0].median(), torch.tensor(3e-4, dtype=torch.float64), rtol=1e-3, atol=0)
     for key, value in weights(population).items():
         assert torch.equal(value, expected[key]), key
+
+
+def test_weights_that_mean_something_else_are_not_taken() -> None:
+    learner, other = sac_learner(), sac_learner()
+    other.policy.network.scaling.observation_scale.mul_(2.0)  # type: ignore[union-attr]
+    before = weights(learner)
+    with pytest.raises(ValueError, match="the two learners scale their inputs differently"):
+        learner.start_from(other)
+    learner.start_from(sac_learner(seed=1))
+    before = weights(learner)
+    with pytest.raises(ValueError, match="the Policy of one learner has weights of shapes"):
+        learner.start_from(sac_learner(2))
+    assert all(torch.equal(value, before[key]) for key, value in weights(learner).items())
 
 
 def test_the_policy_that_acts_is_the_one_that_learns(make_rows: Rows) -> None:

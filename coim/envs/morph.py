@@ -228,7 +228,7 @@ class MorphEnv(Fleet, DesignedEnv):
         check_step(given.get("design", None), self._design)
         idle = idle_rows(given, self.batch_size)
         with self.holding(idle):
-            observation, reward, terminated = self.advance(given.get("action"))
+            observation, reward, terminated = self.advance(given["action"])
         truncated = self._step_count >= self.episode_steps
         values = {
             "observation": observation,

@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step, idle_rows, leave_idle
 from coim.randomness import restore_generator
@@ -60,7 +61,7 @@ class WorldModelEnv(DesignedEnv):
         rng: the dream's own generator; its state is all that a dream carries from one call of `advance` to the next.
 
     Raises:
-        TypeError: if ``env`` is a TransformedEnv.
+        TypeError: if ``env`` is a TransformedEnv, or no body: a `SerialEnv`, an environment without a design.
         ValueError: if a start state has an entry that is not finite, or a design that leaves the bounds, or if the
             reward of ``env`` is not ``[*B, 1]``.
 
@@ -78,6 +79,11 @@ class WorldModelEnv(DesignedEnv):
             raise TypeError(
                 "model and reward are of what the bodies themselves observe: pass env.base_env to the dream, and put "
                 "the transforms around it, TransformedEnv(dream, ...)"
+            )
+        if isinstance(env, BatchedEnvBase) or not (hasattr(env, "reward_fn") and hasattr(env, "design_spec")):
+            raise TypeError(
+                f"a {type(env).__name__} has no reward_fn and design_spec of its own; pass one of the bodies that are "
+                "dreamt of, such as a MorphEnv, and give the dream any batch_size"
             )
         super().__init__(device=env.device, batch_size=torch.Size(batch_size))
         self.ensemble = ensemble
@@ -120,7 +126,7 @@ class WorldModelEnv(DesignedEnv):
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step the states that the tensordict holds, ``observation`` and ``design``; its own where one is missing."""
         self._assert_tensordict_shape(tensordict)
-        given = tensordict.select(*STATE_KEYS, strict=False)
+        given = self._as_specified(tensordict)
         own = {} if set(STATE_KEYS) <= set(given.keys()) else self._present()
         self._state = TensorDict({**own, **given}, self.batch_size, device=self.device)
         return super().step(tensordict)
@@ -131,7 +137,8 @@ class WorldModelEnv(DesignedEnv):
         seen = tensordict.get("observation", None)
         if seen is not None and not seen.requires_grad:  # the caller has cut the gradient: no graph grows in here
             observation = observation.detach()
-        next_observation, reward = self.advance(observation, tensordict["action"], design)
+        action = tensordict["action"].to(observation.dtype)
+        next_observation, reward = self.advance(observation, action, design)
         idle = idle_rows(tensordict, self.batch_size)
         if idle is not None:
             next_observation = torch.where(idle.unsqueeze(-1), observation, next_observation)
@@ -147,7 +154,7 @@ class WorldModelEnv(DesignedEnv):
         everywhere = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         which = everywhere
         if tensordict is not None:
-            given = tensordict.select(*STATE_KEYS, strict=False)
+            given = self._as_specified(tensordict)
             which = tensordict.get("_reset", everywhere).reshape(self.batch_size)
             self._check_start(given, which)
             # Rows that are not reset keep the start that they had; EnvBase.reset leaves their state as it is.
@@ -183,6 +190,11 @@ class WorldModelEnv(DesignedEnv):
         super().__setstate__(state)
         self.rng = torch.Generator(device)
         restore_generator(self.rng, generator_state)
+
+    def _as_specified(self, given: TensorDictBase) -> TensorDict:
+        """The states in a tensordict, as far as there are some, in the dtypes of the specs; gradients flow."""
+        states = given.select(*STATE_KEYS, strict=False).items()
+        return TensorDict({key: state.to(self.observation_spec[key].dtype) for key, state in states}, self.batch_size)
 
     def _present(self) -> TensorDict:
         """Where the rows are: at their starts, before any reset."""

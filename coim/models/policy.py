@@ -175,7 +175,7 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
         torch.Size([256, 6])
     """
     space = env.action_spec.space
-    if space is None or not (torch.all(space.low == -1) and torch.all(space.high == 1)):
+    if not hasattr(space, "low") or not (torch.all(space.low == -1) and torch.all(space.high == 1)):
         raise ValueError(f"a tanh acts in [-1, 1], not in {space}; rescale with torchrl.envs.ActionScaling")
     seen, scaling = env.observation_spec["observation"], InputScaling.for_env(env)
     with torch.device("cpu"):

@@ -19,7 +19,7 @@ from torchrl.objectives import LossModule
 
 from .functional import gaussian_nll
 from .moving import move
-from .runs import check_batch, check_num_runs, split_runs
+from .runs import check_batch, check_num_runs, check_runs_last, split_runs
 
 
 class EnsembleNLLLoss(LossModule):
@@ -110,6 +110,7 @@ class EnsembleNLLLoss(LossModule):
         check_one_step(tensordict, self.tensor_keys.steps_to_next_obs)
         observation = tensordict[self.tensor_keys.observation]
         check_batch(observation.shape[:-1], self.num_runs)
+        check_runs_last(tensordict, self.num_runs)
         next_observation = tensordict[unravel_key(("next", self.tensor_keys.observation))]
         with self.ensemble_params.to_module(self.ensemble, preserve_module_state=False):
             out = self.ensemble(tensordict.select(*self.ensemble.in_keys))

@@ -43,6 +43,21 @@ def check_batch(batch: Sequence[int], num_runs: int | None) -> None:
         raise ValueError(f"a batch of size {list(batch)} has no rows; a mean needs at least one")
 
 
+def check_runs_last(rows: TensorDictBase, num_runs: int | None) -> None:
+    """Refuse rows ``[K, T]`` as a rollout returns them, where there are as many steps as runs.
+
+    The name that TorchRL gives to the dimension of time tells: by their sizes they look like ``[B, K]``.
+
+    Raises:
+        ValueError: if time is where the runs must be.
+    """
+    if num_runs is not None and num_runs > 1 and rows.batch_dims and rows.names[-1] == "time":
+        raise ValueError(
+            f"time is the last dimension of rows {list(rows.batch_size)}, where the {num_runs} runs must be; "
+            "transpose(-2, -1) what env.rollout returns"
+        )
+
+
 def split_runs(rows: Tensor, num_runs: int | None) -> Tensor:
     """Bring one number per row, ``[*B, (K)]``, into the shape ``[R, K]``; ``[R, 1]`` without a run axis."""
     return rows.reshape(-1, num_runs or 1)
@@ -63,6 +78,7 @@ def by_update(rows: TensorDictBase, num_runs: int | None) -> TensorDictBase:
     if runs == 1 and (len(size) == 1 or (num_runs is None and len(size) == 2 and size[1] != 1)):
         rows = rows.unsqueeze(-1)
     check_batch(rows.batch_size, num_runs)
+    check_runs_last(rows, num_runs)
     if rows.batch_dims == 2:
         rows = rows.unsqueeze(0)
     if rows.batch_dims != 3 or rows.batch_size[-1] != runs:

@@ -31,7 +31,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 
 from .functional import bellman_target, mixing_weights, policy_loss, qvalue_loss, soft_value
 from .moving import move
-from .runs import check_batch, check_num_runs, split_runs
+from .runs import check_batch, check_num_runs, check_runs_last, split_runs
 
 
 class CriticList(TensorDictModuleBase):
@@ -203,6 +203,7 @@ class CoImSACLoss(LossModule):
             rows, or with ``reduction="none"`` ``[*B, (K)]``.
         """
         check_batch(tensordict[self.tensor_keys.action].shape[:-1], self.num_runs)
+        check_runs_last(tensordict, self.num_runs)
         # First the target's draw, then the actor's, as TorchRL does.
         loss_qvalue, td_error = self.qvalue_loss(tensordict)
         loss_actor, log_prob = self.actor_loss(tensordict)

@@ -15,8 +15,10 @@ from torchrl.envs import (
     CatTensors,
     EnvBase,
     ObservationNorm,
+    PendulumEnv,
     RenameTransform,
     RewardScaling,
+    SerialEnv,
     StepCounter,
     TensorDictPrimer,
     Transform,
@@ -106,6 +108,17 @@ def test_a_reset_may_give_only_new_designs() -> None:
     state = dream.reset(TensorDict({"design": torch.ones(7, 2)}, [7]))
     assert torch.equal(state["observation"], start["observation"])
     assert torch.equal(state["design"], torch.ones(7, 2))
+
+
+def test_numbers_of_another_dtype_are_brought_to_that_of_the_specs() -> None:
+    dream, twin, action = make_dream(7), make_dream(7), torch.full((7, 1), 0.5)
+    for start in (start_of(7), start_of(7, seed=1)):
+        state = dream.reset(start.double())
+        assert torch.equal(state["observation"], start["observation"])
+        given = TensorDict({**start.double(), "action": action.double()}, [7])
+        after, expected = (env.step(td)["next"] for env, td in ((dream, given), (twin, start.set("action", action))))
+        assert after["observation"].dtype == torch.float32
+        assert (after == expected).all()
 
 
 def test_a_step_by_hand() -> None:
@@ -463,7 +476,7 @@ def test_a_dream_that_is_moved_takes_its_random_numbers_and_its_states_along() -
     assert torch.equal(a, b)
 
 
-def test_a_transformed_environment_and_a_flat_reward_are_refused() -> None:
+def test_what_is_no_bare_body_and_a_flat_reward_are_refused() -> None:
     class FlatlyPaid(PointMass):
         @staticmethod
         def reward_fn(observation: Tensor, action: Tensor, next_observation: Tensor, design: Tensor) -> Tensor:
@@ -471,6 +484,9 @@ def test_a_transformed_environment_and_a_flat_reward_are_refused() -> None:
 
     with pytest.raises(TypeError, match=r"pass env.base_env to the dream"):
         WorldModelEnv(Physics(), TransformedEnv(PointMass(), StepCounter()), batch_size=[3])
+    for env in (SerialEnv(2, PointMass), PendulumEnv()):
+        with pytest.raises(TypeError, match=rf"a {type(env).__name__} has no reward_fn and design_spec of its own"):
+            WorldModelEnv(Physics(), env, batch_size=[3])
     with pytest.raises(ValueError, match=r"the reward of FlatlyPaid has shape \[2\] .*not \[2, 1\]"):
         WorldModelEnv(Physics(), FlatlyPaid(), batch_size=[3])
 

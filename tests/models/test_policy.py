@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Composite, MultiOneHot, Unbounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from coim.models import make_policy, select_run
@@ -79,7 +79,7 @@ def test_a_foreign_environment_needs_three_specs_only():
     assert policy(td)["action"].shape == (1, 2)
 
 
-@pytest.mark.parametrize("spec", [Bounded(-2, 2, shape=(2,)), Unbounded((2,))])
+@pytest.mark.parametrize("spec", [Bounded(-2, 2, shape=(2,)), Unbounded((2,)), MultiOneHot([3, 3])])
 def test_actions_that_a_tanh_cannot_reach_are_refused(toy_env, spec):
     class Foreign:
         observation_spec, design_spec, action_spec = toy_env.observation_spec, toy_env.design_spec, spec

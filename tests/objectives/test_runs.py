@@ -20,6 +20,14 @@ def test_a_batch_without_the_run_axis_is_refused():
         check_batch([0], None)
 
 
+def test_time_where_the_runs_must_be_is_refused_even_if_there_are_as_many_steps_as_runs():
+    rollout = TensorDict(batch_size=[3, 3], names=["runs", "time"])
+    with pytest.raises(ValueError, match=r"time is the last dimension of rows \[3, 3\], where the 3 runs must be"):
+        by_update(rollout, 3)
+    assert by_update(rollout.transpose(0, 1), 3).shape == (1, 3, 3)
+    assert by_update(rollout[:1].transpose(0, 1), 1).shape == (1, 3, 1)
+
+
 def test_networks_of_another_number_of_runs_are_refused():
     network = nn.Identity()
     check_num_runs(3, network)
