@@ -145,6 +145,8 @@ def check_networks(
                 f"{found[1]}, the critics read {found[2]}; make them with make_policy(env) and make_qvalue(env)"
             )
     for name, trained in {"population": population, "individual": individual, "dynamics": dynamics}.items():
+        if trained is not None:
+            trained.check_networks_lie_here()
         if trained is not None and (dtype := trained.weights_by_run()[0].dtype) != wanted:
             raise ValueError(f"the weights of {name} are {dtype}, the bodies observe in {wanted}; leave them in that")
     check_exchangeable((individual.policy, individual.qvalue), (population.policy, population.qvalue))

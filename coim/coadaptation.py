@@ -109,6 +109,7 @@ class CoAdaptation:
             search leaves the bounds, first designs have the wrong shape, dtype or device, or learners that are not on
             the CPU shall go side by side.
         TypeError: if an environment or the dream is behind transforms, or a part is no such thing at all.
+        RuntimeError: if networks were moved after their learner was made.
 
     Note:
         Whoever stops at an event may come back to it: iterating again goes on with what comes next, and so does another

@@ -128,6 +128,15 @@ class DynamicsLearner:
         parameters = [*self.ensemble.network.parameters()]
         return moments_by_run(self.optimiser, self._weights, parameters, self.num_runs)
 
+    def check_networks_lie_here(self) -> None:
+        """Refuse to go on with an ensemble that was moved, or given to another learner, after this one was made.
+
+        Raises:
+            RuntimeError: if the ensemble's weights no longer lie in the flat buffer.
+        """
+        if next(self.ensemble.network.parameters()).data_ptr() != self._weights.data_ptr():
+            raise RuntimeError("the ensemble was moved after its learner was made; make the learner last")
+
     @torch.no_grad()
     def error(self, rows: TensorDictBase) -> Tensor:
         """Squared error of the members' means, in units of the variance of one-step changes in these rows.
@@ -164,8 +173,7 @@ class DynamicsLearner:
             RuntimeError: if the ensemble's weights no longer lie in the flat buffer.
         """
         batches = by_update(batches, self.num_runs)
-        if next(self.ensemble.network.parameters()).data_ptr() != self._weights.data_ptr():
-            raise RuntimeError("the ensemble was moved after its learner was made; make the learner last")
+        self.check_networks_lie_here()
         mean = self._updates.mean(zip(*self._arrange(self._taken(batches))))
         return TensorDict({"loss_dynamics": mean}, mean.shape)
 

@@ -161,6 +161,16 @@ class SACLearner:
         """Adam's moments, as `weights_by_run` has the weights; none before its first step."""
         return moments_by_run(self.optimiser, self._weights, self._parameters(), self.num_runs)
 
+    def check_networks_lie_here(self) -> None:
+        """Refuse to go on with networks that were moved, or given to another learner, after this one was made.
+
+        Raises:
+            RuntimeError: if the networks' weights no longer lie in the flat buffer.
+        """
+        lies_at = {parameter.data_ptr() for parameter in self._parameters()}
+        if lies_at != {view.data_ptr() for view in views(self._weights, self._parameters())}:
+            raise RuntimeError("the networks were moved after their learner was made; make the learner last")
+
     def _parameters(self) -> list[Tensor]:
         return [*self.policy.network.mlp.parameters(), *self.qvalue.module.mlp.parameters()]
 
@@ -183,9 +193,7 @@ class SACLearner:
         """
         batches = by_update(batches, self.num_runs)
         check_sac_rows(batches, self.loss.tensor_keys)
-        lies_at = {parameter.data_ptr() for parameter in self._parameters()}
-        if lies_at != {view.data_ptr() for view in views(self._weights, self._parameters())}:
-            raise RuntimeError("the networks were moved after their learner was made; make the learner last")
+        self.check_networks_lie_here()
         for name, tensor in self._read_numbers.items():
             tensor.fill_(self._numbers()[name])
         rows = self._arrange(on_device(batches, self._weights.device))

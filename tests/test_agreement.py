@@ -265,6 +265,17 @@ def test_what_is_no_such_part_is_refused() -> None:
     algorithm(search=None, bodies="random")
 
 
+@pytest.mark.parametrize("which", ["population", "dynamics"])
+def test_networks_that_were_moved_after_their_learner_was_made_are_refused(which: str) -> None:
+    parts = {"population": learner()} | dreaming()
+    parts["population"].policy.double().float()
+    if which == "dynamics":
+        parts["population"] = learner()
+        parts["dynamics"].ensemble.double().float()
+    with pytest.raises(RuntimeError, match=r"moved after .* learner was made; make the learner last"):
+        algorithm(**parts)
+
+
 def test_the_simulator_of_the_same_body_may_imagine() -> None:
     algorithm(**simulated_dream(HopperMorph))
 

@@ -40,10 +40,17 @@ class CriticList(TensorDictModuleBase):
     Args:
         critics: TensorDict modules that all write ``key``.
         key: where the values are.
+
+    Raises:
+        ValueError: if there is none, or one of them is there twice: the two would always say the same.
     """
 
     def __init__(self, critics: Sequence[TensorDictModule], *, key: NestedKey = "state_action_value") -> None:
         super().__init__()
+        if not critics or len({id(critic) for critic in critics}) < len(critics):
+            raise ValueError(
+                f"a list of {len(critics)} critics that are not as many different modules; make one for each entry"
+            )
         self.critics = nn.ModuleList(critics)
         self.in_keys = list(dict.fromkeys(k for critic in critics for k in critic.in_keys))
         self.out_keys = [key]
@@ -75,8 +82,8 @@ class CoImSACLoss(LossModule):
         reduction: ``"mean"`` as above; ``"sum"`` over all rows; ``"none"``: one number for each row, ``[*B, (K)]``.
 
     Raises:
-        ValueError: if ``mix`` or ``reduction`` is unknown or they do not go together, a number is out of its range, or
-            ``num_runs`` is not that of the networks.
+        ValueError: if ``mix`` or ``reduction`` is unknown or they do not go together, a number is out of its range,
+            ``num_runs`` is not that of the networks, or a list of critics is empty or has one of them twice.
 
     Note:
         Optional entries: ``imagined`` (bool, ``[*B, 1]``; absent: all rows are real); ``steps_to_next_obs``
@@ -164,9 +171,9 @@ class CoImSACLoss(LossModule):
             raise ValueError(f"gamma={gamma} is outside [0, 1]; Sec. 6.1 has 0.99")
         if not alpha >= 0:
             raise ValueError(f"alpha={alpha} is below 0; Sec. 6.1 has 0.01, 0 switches the entropy off")
+        check_num_runs(num_runs, policy, *([qvalue] if isinstance(qvalue, nn.Module) else qvalue))
         if not isinstance(qvalue, nn.Module):
             qvalue = CriticList(qvalue)
-        check_num_runs(num_runs, policy, qvalue)
         self.alpha, self.gamma, self.mix, self.num_runs = alpha, gamma, mix, num_runs
         self.reduction = reduction
         self.convert_to_functional(policy, "policy")

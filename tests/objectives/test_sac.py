@@ -429,6 +429,21 @@ def test_noise_for_a_policy_that_is_no_tanh_normal_is_refused(policy, qvalue, ma
         build(policy, qvalue)(with_noise(make_rows(4)))
 
 
+def test_a_list_of_critics_that_is_none_is_refused(toy_env, policy):
+    critic = make_qvalue(toy_env, num_critics=1)
+    for critics in ([], [critic, critic]):
+        with pytest.raises(
+            ValueError, match=f"a list of {len(critics)} critics that are not as many different modules"
+        ):
+            CoImSACLoss(policy, critics)
+    fleet, alone = [make_policy(toy_env, num_runs=runs) for runs in (3, None)]
+    others = [[make_qvalue(toy_env, num_critics=1, num_runs=runs) for _ in range(2)] for runs in (None, 3)]
+    with pytest.raises(ValueError, match="num_runs=3, but QValue was built with num_runs=None"):
+        CoImSACLoss(fleet, others[0], num_runs=3)
+    with pytest.raises(ValueError, match="num_runs=None, but QValue was built with num_runs=3"):
+        CoImSACLoss(alone, others[1])
+
+
 def test_bad_input_is_named(toy_env, policy, qvalue, make_rows):
     with pytest.raises(ValueError, match="mix='mean' is unknown; choose 'batch' or 'sum'"):
         CoImSACLoss(policy, qvalue, mix="mean")
