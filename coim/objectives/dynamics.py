@@ -19,7 +19,7 @@ from torchrl.objectives import LossModule
 
 from .functional import gaussian_nll
 from .moving import move
-from .runs import check_batch, check_num_runs, check_runs_last, split_runs
+from .runs import check_batch, check_by_row, check_num_runs, check_runs_last, split_runs
 
 
 class EnsembleNLLLoss(LossModule):
@@ -36,7 +36,7 @@ class EnsembleNLLLoss(LossModule):
 
     Raises:
         ValueError: if ``num_runs`` is not that of the ensemble.  When called: if a next observation is more than one
-            step ahead (``steps_to_next_obs``).
+            step ahead (``steps_to_next_obs``), or means are not ``[*B, (K,) E, S]``.
 
     Note:
         All members see the same rows.  Chua et al. [3] draw a bootstrap of the data for each member instead; here
@@ -116,6 +116,7 @@ class EnsembleNLLLoss(LossModule):
             out = self.ensemble(tensordict.select(*self.ensemble.in_keys))
             target = self.ensemble.standardised_target(observation, next_observation)
         mean, log_var = out[self.tensor_keys.mean], out[self.tensor_keys.log_var]
+        check_by_row("the members' means", mean.shape[:-2], observation.shape[:-1], "[*B, E, S]")
         nll = gaussian_nll(mean, log_var, target.unsqueeze(-2)).sum(-1)  # members
         return TensorDict({"loss_dynamics": split_runs(nll, self.num_runs).mean(0).sum()})
 

@@ -58,6 +58,22 @@ def check_runs_last(rows: TensorDictBase, num_runs: int | None) -> None:
         )
 
 
+def check_by_row(what: str, found: Sequence[int], batch: Sequence[int], wanted: str) -> None:
+    """Refuse what a network wrote with another batch than its input: rows would meet the numbers of other rows.
+
+    Args:
+        what: it is, for the sentence.
+        found: its batch.
+        batch: of the input.
+        wanted: shape of the whole.
+
+    Raises:
+        ValueError: if the two differ.
+    """
+    if list(found) != list(batch):
+        raise ValueError(f"{what} must be {wanted} with *B = {list(batch)}, and are [*B, ...] with *B = {list(found)}")
+
+
 def split_runs(rows: Tensor, num_runs: int | None) -> Tensor:
     """Bring one number per row, ``[*B, (K)]``, into the shape ``[R, K]``; ``[R, 1]`` without a run axis."""
     return rows.reshape(-1, num_runs or 1)

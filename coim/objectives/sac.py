@@ -31,7 +31,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 
 from .functional import bellman_target, mixing_weights, policy_loss, qvalue_loss, soft_value
 from .moving import move
-from .runs import check_batch, check_num_runs, check_runs_last, split_runs
+from .runs import check_batch, check_by_row, check_num_runs, check_runs_last, split_runs
 
 
 class CriticList(TensorDictModuleBase):
@@ -83,7 +83,8 @@ class CoImSACLoss(LossModule):
 
     Raises:
         ValueError: if ``mix`` or ``reduction`` is unknown or they do not go together, a number is out of its range,
-            ``num_runs`` is not that of the networks, or a list of critics is empty or has one of them twice.
+            ``num_runs`` is not that of the networks, or a list of critics is empty or has one of them twice.  When
+            called: if values are not ``[*B, (K,) N]``, or log-densities not ``[*B, (K)]``.
 
     Note:
         Optional entries: ``imagined`` (bool, ``[*B, 1]``; absent: all rows are real); ``steps_to_next_obs``
@@ -261,7 +262,9 @@ class CoImSACLoss(LossModule):
         ):
             dist = self.policy.get_dist(tensordict.select(*self.policy.in_keys))
         noise = tensordict.get(self.tensor_keys.noise, None)
-        return compute_rsample_log_prob(dist) if noise is None else reparametrised(dist, noise)
+        action, log_prob = compute_rsample_log_prob(dist) if noise is None else reparametrised(dist, noise)
+        check_by_row("the policy's log-densities", log_prob.shape, action.shape[:-1], "[*B]")
+        return action, log_prob
 
     def _values(self, tensordict: TensorDictBase, action: Tensor | None = None) -> Tensor:
         if action is None:
@@ -269,7 +272,10 @@ class CoImSACLoss(LossModule):
         else:
             inputs = tensordict.select(*(key for key in self.qvalue.in_keys if key != self.tensor_keys.action))
             inputs.set(self.tensor_keys.action, action)
-        return self.qvalue(inputs)[self.tensor_keys.state_action_value]
+        batch = inputs[self.tensor_keys.action].shape[:-1]
+        values = self.qvalue(inputs)[self.tensor_keys.state_action_value]
+        check_by_row("the critics' values", values.shape[:-1], batch, "[*B, N], the critics last,")
+        return values
 
     def _reduced(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Mean over the batch in the sense of ``mix`` and sum over runs, or what ``reduction`` says instead."""

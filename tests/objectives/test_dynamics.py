@@ -47,6 +47,19 @@ def test_the_closed_form_with_foreign_nested_keys():
     assert loss.ensemble.mean.grad.flatten().tolist() == [-5.0, -3.0]  # -2 (2.5 - member)
 
 
+def test_means_without_the_axis_of_the_members_are_refused():
+    class Alone(Constant):
+        def forward(self, tensordict):
+            super().forward(tensordict)
+            return tensordict.set(("out", "mean"), tensordict["out", "mean"][..., 0, :])
+
+    loss = EnsembleNLLLoss(Alone())
+    loss.set_keys(observation=("agent", "state"), mean=("out", "mean"), log_var=("out", "log_var"))
+    state = {"agent": {"state": torch.zeros(2, 1)}}
+    with pytest.raises(ValueError, match=r"the members' means must be \[\*B, E, S\] with \*B = \[2\], .* \*B = \[\]"):
+        loss(TensorDict({**state, "next": state}, [2]))
+
+
 def test_it_is_the_density_of_torchs_normal(make_rows):
     rows = make_rows(20)
     ensemble = ensemble_on(rows)

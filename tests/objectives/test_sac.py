@@ -429,6 +429,17 @@ def test_noise_for_a_policy_that_is_no_tanh_normal_is_refused(policy, qvalue, ma
         build(policy, qvalue)(with_noise(make_rows(4)))
 
 
+def test_values_and_densities_that_are_not_one_per_row_are_refused(policy, qvalue, make_rows):
+    # Broadcast, they would give a loss: of the least value in the batch, or of each row's reward with all densities.
+    one = nn.Sequential(nn.Linear(2, 1), nn.Flatten(0)).double()
+    flat = TensorDictModule(one, in_keys=["action"], out_keys=qvalue.out_keys)
+    with pytest.raises(ValueError, match=r"the critics' values must be \[\*B, N\], .* \*B = \[4\], .* \*B = \[\]"):
+        build(policy, flat, distinct_targets=False)(make_rows(4))
+    policy[-1].distribution_class = torch.distributions.Normal
+    with pytest.raises(ValueError, match=r"the policy's log-densities must be \[\*B\] with \*B = \[4\], .* = \[4, 2\]"):
+        build(policy, qvalue)(make_rows(4))
+
+
 def test_a_list_of_critics_that_is_none_is_refused(toy_env, policy):
     critic = make_qvalue(toy_env, num_critics=1)
     for critics in ([], [critic, critic]):
