@@ -11,9 +11,11 @@ import dataclasses
 import multiprocessing
 import os
 import random
+import signal
 import tempfile
 import time
 from collections.abc import Iterator
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -126,6 +128,13 @@ def start(folder: Path, settings: Settings) -> BaseProcess:
     PLAIN.set_forkserver_preload(["recipes.experiment"])
     # Who is killed cannot give its semaphores back; that they are collected in the end is no news.
     os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
+    # Ctrl-C at a terminal reaches that one too, which takes seconds to import and has no line of its own to say.
+    resource_tracker.ensure_running()  # which lets Ctrl-C through when it has begun
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     process = PLAIN.Process(target=make_or_resume, args=(folder, settings))
     process.start()
     return process

@@ -72,6 +72,7 @@ def written_aside(path: Path) -> Iterator[Path]:
     aside = path.with_name(ASIDE.format(path.name))
     try:
         with telling_full_disk(path):
+            aside.touch()  # a folder that cannot be written to is an error of ours, and not many lines of a library
             yield aside
             sync(aside)
             os.replace(aside, path)

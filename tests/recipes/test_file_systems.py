@@ -123,6 +123,17 @@ def test_a_file_that_finds_no_room_stays_as_it_was_and_nothing_lies_beside_it(
     assert path.read_text() == "old"
 
 
+def test_a_library_is_not_asked_to_write_into_a_folder_that_is_read_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr("pathlib.Path.touch", refuse)
+    with pytest.raises(OSError, match="Read-only file system"), written_aside(tmp_path / "film.mp4"):
+        pytest.fail("an encoder would say so in three lines of its own")
+
+
 @pytest.mark.parametrize("error", [RuntimeError("inline_container.cc:664"), OSError("the writer has failed")])
 def test_a_librarys_own_error_is_told_as_a_full_disk_only_on_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import signal
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -53,6 +54,21 @@ def test_a_soak_that_is_told_to_end_takes_its_run_with_it() -> None:
     with pytest.raises(KeyboardInterrupt):
         soak.finish(process)
     process.kill.assert_called_once_with()
+
+
+def test_ctrl_c_is_kept_from_the_process_that_imports_for_all_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONWARNINGS", "error")
+    kept_from: list[bool] = []
+    for name in ("forkserver.ensure_running", "PLAIN.Process"):
+        monkeypatch.setattr(f"recipes.soak.{name}", lambda *args, **kwargs: kept_from.append(blocked()) or Mock())
+
+    def blocked() -> bool:
+        return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+    soak.start(tmp_path, soak.SMALL)
+    assert kept_from == [True, False]
 
 
 def test_what_differs_is_named() -> None:
