@@ -68,8 +68,8 @@ class MorphEnv(Fleet, DesignedEnv):
         num_broken: how often each row's simulation broke so far, ``[K]`` int64.
 
     Raises:
-        ValueError: an argument is out of range, the device is not there, the names of the design's entries or the
-            scale of the observation do not fit, the body is no planar runner, or the reward is not ``[*B, 1]``.
+        ValueError: an argument is out of range, the device is not there, the names or bounds of the design's entries
+            or the scale of the observation do not fit, the body is no planar runner, or the reward is not ``[*B, 1]``.
     """
 
     def __init__(
@@ -91,7 +91,9 @@ class MorphEnv(Fleet, DesignedEnv):
         self.task, self.episode_steps = task, episode_steps
         self.reset_noise = self.RESET_NOISE if reset_noise is None else reset_noise
         if not 0 <= self.reset_noise < math.inf:
-            raise ValueError(f"reset_noise {reset_noise} is not a finite number of at least 0; 0 gives the bare start")
+            raise ValueError(
+                f"reset_noise {self.reset_noise} is not a finite number of at least 0; 0 gives the bare start"
+            )
         super().__init__(device=_existing(device), batch_size=torch.Size([num_runs]))
         self._begin(num_runs, num_threads)
         self._make_specs()
@@ -254,8 +256,16 @@ class MorphEnv(Fleet, DesignedEnv):
         return self.device is None or self.device.type == "cpu"
 
     def _check_numbers(self) -> None:
-        """Refuse a scale of the observation or a reward that does not fit the body."""
+        """Refuse bounds, steps, a scale of the observation or a reward that do not fit the body."""
         name, size, scale = type(self).__name__, self._observation.shape[-1], self.OBSERVATION_SCALE
+        low, high = self.DESIGN_BOUNDS
+        if not (0 < low <= 1 <= high < math.inf and low < high):
+            raise ValueError(
+                f"{name}.DESIGN_BOUNDS is {self.DESIGN_BOUNDS}; they are factors of lengths, low < high, with 1 "
+                "between them: the body as drawn, which is the first"
+            )
+        if not isinstance(self.FRAME_SKIP, int) or self.FRAME_SKIP < 1:
+            raise ValueError(f"{name}.FRAME_SKIP is {self.FRAME_SKIP}, not a whole number of at least 1")
         if len(scale) not in (size, size + self._first_position) or not all(0 < entry < math.inf for entry in scale):
             raise ValueError(
                 f"{name}.OBSERVATION_SCALE is {scale}, not {size} positive numbers, one for each observed quantity"

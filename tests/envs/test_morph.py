@@ -388,6 +388,22 @@ def test_without_names_the_entries_are_counted():
     assert Nameless.design_names() == ("design 0", "design 1", "design 2", "design 3")
 
 
+@pytest.mark.parametrize(
+    ("constants", "sentence"),
+    [
+        ({"DESIGN_BOUNDS": (2.0, 0.5)}, r"Odd\.DESIGN_BOUNDS is \(2\.0, 0\.5\); .* low < high, with 1 between them"),
+        ({"DESIGN_BOUNDS": (1.0, 1.0)}, "low < high"),
+        ({"DESIGN_BOUNDS": (1.2, 2.0)}, "with 1 between them: the body as drawn, which is the first"),
+        ({"DESIGN_BOUNDS": (0.5, math.nan)}, "low < high"),
+        ({"FRAME_SKIP": 0}, r"Odd\.FRAME_SKIP is 0, not a whole number of at least 1"),
+        ({"RESET_NOISE": -0.1}, "reset_noise -0.1 is not a finite number"),
+    ],
+)
+def test_constants_that_no_body_can_have_are_refused(constants, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        type("Odd", (HopperMorph,), constants)()
+
+
 @pytest.mark.parametrize("names", [("a", "b", "c"), ("a", "b", "c", "c"), ("a", "b", "c", "d,e"), ("a", "b", "c", "")])
 def test_names_that_do_not_fit_the_design_are_refused(names):
     class Misnamed(HopperMorph):
