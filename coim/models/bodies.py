@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.envs import AsyncEnvPool, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
@@ -42,6 +43,20 @@ def _workers(env: BatchedEnvBase | AsyncEnvPool) -> list[EnvBase]:
     if isinstance(env, AsyncEnvPool):
         return [maker if isinstance(maker, EnvBase) else maker() for maker in env.env_makers]
     return [make(**given) for make, given in zip(env.create_env_fn, env.create_env_kwargs)]
+
+
+def observed(env: EnvBase) -> TensorSpec:
+    """Spec of what networks read as ``observation``, transforms included.
+
+    Raises:
+        ValueError: if there is no such entry, as behind a transform that gives it another name.
+    """
+    if "observation" not in env.observation_spec.keys():  # noqa: SIM118
+        raise ValueError(
+            f"the environment observes {[str(key) for key in env.observation_spec.keys()]}, and the networks read "  # noqa: SIM118
+            "'observation': keep that name, with create_copy=True in a RenameTransform or del_keys=False in CatTensors"
+        )
+    return env.observation_spec["observation"]
 
 
 def design_bounds(env: EnvBase) -> tuple[Tensor, Tensor, Tensor]:

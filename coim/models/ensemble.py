@@ -24,7 +24,7 @@ from torchrl.envs import EnvBase
 from coim.angles import wrap_angle
 from coim.calling import called_as
 
-from .bodies import body_of, design_bounds
+from .bodies import body_of, design_bounds, observed
 from .normaliser import RunningNormaliser
 from .stacked import StackedMLP
 
@@ -134,10 +134,10 @@ class GaussianEnsemble(TensorDictModuleBase):
             num_runs: ``K``, or None for a single run.
 
         Raises:
-            ValueError: if a transform rewrites observations in which there are angles, or the workers of ``env`` are
-                not alike.
+            ValueError: if a transform rewrites observations in which there are angles, there is no ``observation``, or
+                the workers of ``env`` are not alike.
         """
-        seen = env.observation_spec["observation"]
+        seen = observed(env)
         body, rewritten = body_of(env)
         angle_indices = getattr(body, "angle_indices", ())
         if rewritten and angle_indices:

@@ -19,6 +19,7 @@ from torchrl.modules import ProbabilisticActor, SafeProbabilisticModule, TanhNor
 
 from coim.calling import altered_part
 
+from .bodies import observed
 from .scaling import InputScaling
 from .stacked import StackedLinear, StackedMLP
 
@@ -166,7 +167,8 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
         the same policy on each device.
 
     Raises:
-        ValueError: if the actions of ``env`` are not bounded by -1 and 1, or its workers are not alike.
+        ValueError: if the actions of ``env`` are not bounded by -1 and 1, it has no ``observation``, or its workers are
+            not alike.
 
     Example:
         >>> policy = Policy(PolicyNetwork(17, 6, 6))
@@ -177,7 +179,7 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
     space = env.action_spec.space
     if not hasattr(space, "low") or not (torch.all(space.low == -1) and torch.all(space.high == 1)):
         raise ValueError(f"a tanh acts in [-1, 1], not in {space}; rescale with torchrl.envs.ActionScaling")
-    seen, scaling = env.observation_spec["observation"], InputScaling.for_env(env)
+    seen, scaling = observed(env), InputScaling.for_env(env)
     with torch.device("cpu"):
         network = PolicyNetwork(
             seen.shape[-1],

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from .bodies import observed
 from .scaling import InputScaling
 from .stacked import StackedMLP
 
@@ -107,7 +108,7 @@ def make_qvalue(
         >>> qvalue.module(torch.zeros(256, 17), torch.zeros(256, 6), torch.ones(256, 6)).shape
         torch.Size([256, 2])
     """
-    seen, scaling = env.observation_spec["observation"], InputScaling.for_env(env)
+    seen, scaling = observed(env), InputScaling.for_env(env)
     with torch.device("cpu"):
         network = QValueNetwork(
             seen.shape[-1],

@@ -17,6 +17,7 @@ from torchrl.envs import (
     EnvBase,
     ObservationNorm,
     ParallelEnv,
+    RenameTransform,
     RewardScaling,
     SerialEnv,
     StepCounter,
@@ -111,6 +112,13 @@ def test_observations_that_a_transform_has_scaled_are_not_scaled_again() -> None
     assert constants(TransformedEnv(HopperMorph(seed=0), renamed)) == constants(HopperMorph(seed=0))
     with pytest.raises(ValueError, match=r"entries \[1\] of the observation are angles, and a transform rewrites them"):
         GaussianEnsemble.for_env(normalised("observation"))
+
+
+@pytest.mark.parametrize("make", [make_policy, make_qvalue, GaussianEnsemble.for_env])
+def test_an_environment_without_an_observation_is_refused(make: Callable[..., Any]) -> None:
+    env = TransformedEnv(HopperMorph(seed=0), RenameTransform(in_keys=["observation"], out_keys=["seen"]))
+    with pytest.raises(ValueError, match=r"environment observes \['.*'\], and the networks read 'observation': keep"):
+        make(env)
 
 
 def test_designs_are_scaled_by_the_bounds_that_networks_see() -> None:
