@@ -280,6 +280,10 @@ class SACLearner:
         def by_run(x: Tensor) -> Tensor:
             return x.reshape(len(x), -1, runs, x.shape[-1]).transpose(1, 2).contiguous()
 
+        def number(x: Tensor) -> Tensor:
+            """One of each row, with a dimension of its own or without."""
+            return by_run(x.reshape(*batches.batch_size, 1)).squeeze(-1)
+
         def scaled(rows: TensorDictBase) -> tuple[Tensor, Tensor]:
             """Observation and design as the networks' first layers see them."""
             scaling = self.policy.network.scaling
@@ -287,7 +291,7 @@ class SACLearner:
             observation, design = inputs if scaling is None else scaling(*inputs)
             return by_run(observation), by_run(design)
 
-        flags = by_run(imagined).squeeze(-1)
+        flags = number(imagined)
         weight = [mixing_weights(flag.mT, self.loss.mix, dtype=noise.dtype).mT for flag in flags]
         after = batches["next"]
         observation, design = scaled(batches)
@@ -296,8 +300,8 @@ class SACLearner:
             design=design,
             action=by_run(batches["action"]),
             next_observation=scaled(after)[0],
-            reward=by_run(after["reward"]).squeeze(-1),
-            terminated=by_run(after["terminated"]).squeeze(-1),
+            reward=number(after["reward"]),
+            terminated=number(after["terminated"]),
             noise=by_run(noise),
             next_noise=by_run(next_noise),
             weight=torch.stack(weight),

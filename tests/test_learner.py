@@ -143,6 +143,16 @@ def test_what_a_buffer_samples_is_one_update(make_rows: Rows, num_runs: int | No
     assert all(torch.equal(value, weights(explicit)[key]) for key, value in weights(flat).items())
 
 
+@pytest.mark.parametrize("num_runs", [None, 1, 3])
+def test_a_number_of_a_row_needs_no_dimension_of_its_own(make_rows: Rows, num_runs: int | None) -> None:
+    learner, other, rows = sac_learner(num_runs), sac_learner(num_runs), make_rows(3, num_runs or 1)
+    rows["imagined"] = torch.tensor([False, True, True]).reshape(3, 1, 1).expand(3, num_runs or 1, 1)
+    expected = learner.update(rows)
+    for key in ("imagined", ("next", "reward"), ("next", "terminated")):
+        rows[key] = rows[key].squeeze(-1)
+    assert (other.update(rows) == expected).all()
+
+
 @pytest.mark.parametrize("set_to_none", [True, False])
 def test_forgetting_the_gradients_changes_nothing(make_rows: Rows, set_to_none: bool) -> None:
     learner, other = sac_learner(), sac_learner()

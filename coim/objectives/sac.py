@@ -250,7 +250,7 @@ class CoImSACLoss(LossModule):
         with self.target_qvalue_params.to_module(self.qvalue, preserve_module_state=False):
             value = soft_value(self._values(after, action), log_prob, self.alpha)
         reward, terminated = after[self.tensor_keys.reward], after[self.tensor_keys.terminated]
-        reward, terminated = reward.squeeze(-1), terminated.squeeze(-1)
+        reward, terminated = reward.reshape(value.shape), terminated.reshape(value.shape)
         steps = tensordict.get(self.tensor_keys.steps_to_next_obs, None)
         gamma = self.gamma if steps is None else self.gamma ** steps.reshape(reward.shape).to(reward.dtype)
         return bellman_target(reward, terminated, value, gamma)
@@ -286,7 +286,7 @@ class CoImSACLoss(LossModule):
             rows = rows if importance is None else rows * importance.to(rows.dtype)
             return rows if self.reduction == "none" else rows.sum()
         imagined = tensordict.get(self.tensor_keys.imagined, None)
-        imagined = torch.zeros_like(rows, dtype=torch.bool) if imagined is None else imagined.squeeze(-1)
+        imagined = torch.zeros_like(rows, dtype=torch.bool) if imagined is None else imagined.reshape(rows.shape)
         importance = None if importance is None else split_runs(importance, self.num_runs)
         rows, imagined = split_runs(rows, self.num_runs), split_runs(imagined, self.num_runs)
         return (mixing_weights(imagined, self.mix, importance=importance, dtype=rows.dtype) * rows).sum()

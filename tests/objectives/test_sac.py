@@ -429,6 +429,16 @@ def test_noise_for_a_policy_that_is_no_tanh_normal_is_refused(policy, qvalue, ma
         build(policy, qvalue)(with_noise(make_rows(4)))
 
 
+@pytest.mark.parametrize("batch", [(1,), (6,), (6, 1)])
+def test_a_number_of_a_row_needs_no_dimension_of_its_own(policy, qvalue, make_rows, batch):
+    loss, rows = build(policy, qvalue, mix="sum"), with_noise(make_rows(*batch))
+    rows["imagined"] = torch.arange(len(rows)).reshape(*batch, 1) % 2 == 1
+    expected = loss(rows.clone())
+    for key in ("imagined", ("next", "reward"), ("next", "terminated")):
+        rows[key] = rows[key].squeeze(-1)
+    assert (loss(rows) == expected).all()
+
+
 def test_values_and_densities_that_are_not_one_per_row_are_refused(policy, qvalue, make_rows):
     # Broadcast, they would give a loss: of the least value in the batch, or of each row's reward with all densities.
     one = nn.Sequential(nn.Linear(2, 1), nn.Flatten(0)).double()
