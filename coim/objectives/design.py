@@ -42,7 +42,8 @@ class DesignValue(LossModule):
     Args:
         policy: any TensorDict module that writes the action; it is asked for its deterministic one.
         qvalue: any TensorDict module that writes ``[*B, N]`` values.
-        start_states: ``[n]`` rows of Replay_s0 with whatever the networks read besides design and action.
+        start_states: ``[n]`` rows of Replay_s0 with whatever the networks read besides design and action; copied, so
+            that it does not matter what becomes of them.
         chunk_size: particles evaluated at a time.  None: as many as make 2,000 rows on a CPU, which keeps its cache,
             and 100,000 elsewhere.
         precision: ``"bfloat16"`` evaluates the networks in bfloat16; their weights stay as they are.  On trained
@@ -110,7 +111,7 @@ class DesignValue(LossModule):
         check_num_runs(None, policy, qvalue)
         self.convert_to_functional(policy, "policy")
         self.convert_to_functional(qvalue, "qvalue")
-        self.start_states = start_states.select(*policy.in_keys, *qvalue.in_keys, strict=False).detach()
+        self.start_states = start_states.select(*policy.in_keys, *qvalue.in_keys, strict=False).detach().clone()
         self.chunk_size, self.precision = chunk_size, precision
         broken = [key for key, value in self.start_states.items(True, True) if not value.isfinite().all()]
         if broken:

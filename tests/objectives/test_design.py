@@ -165,3 +165,10 @@ def test_bad_input_is_named(parts):
     starts["observation"][0, 0] = torch.inf
     with pytest.raises(ValueError, match=r"NaN or infinite entries in \['observation'\]"):
         DesignValue(policy, qvalue, starts)
+
+
+def test_rows_that_a_buffer_overwrites_later_change_no_value(parts):
+    fitness = DesignValue(*parts)
+    before = fitness(designs(3))
+    parts[-1]["observation"].fill_(9.0)
+    assert torch.equal(fitness(designs(3)), before)
