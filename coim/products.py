@@ -38,13 +38,14 @@ class Choice(NamedTuple):
 
 
 # Measured on one thread at the shapes of the recipes (batch 256, layers of 200); `make bench` says where it is wrong.
-# "update" is a compiled update of policy and critics, as a multiple of torch.mm's time for the float32 products.
+# "update" is a compiled update of policy and critics, as a multiple of torch.mm's time for the float32 products:
+# `python -m benchmarks --only libraries`.
 FASTEST: dict[Kind, Choice] = {
-    # Xeon with AMX. float32: update 1.39, by oneDNN 1.85. bfloat16: 0.88, by oneDNN 1.00.
+    # Xeon with AMX. float32: update 1.51, by oneDNN 1.91. bfloat16: 0.99, by oneDNN 1.08.
     "AVX-512 of Intel": Choice("torch", "torch"),
     # AMD EPYC 9005: 193 GFLOP/s by oneDNN, 97 by MKL, which takes half the width on processors that are not Intel's.
     "AVX-512": Choice("onednn", "onednn"),
-    # AMD EPYC 7003: 36 GFLOP/s by MKL, 22 by oneDNN; a Xeon limited to AVX2: update 1.3, by oneDNN 1.5.
+    # AMD EPYC 7003: 36 GFLOP/s by MKL, 22 by oneDNN; a Xeon limited to AVX2: update 1.36, by oneDNN 1.57.
     "AVX2": Choice("torch", "emulated"),
     # Not measured: ARM, macOS.
     "other": Choice("torch", "torch"),
