@@ -98,7 +98,10 @@ class Conductor:
         finally:
             for reference in running:  # a cluster outlives this process
                 ray.cancel(reference, force=True)
-            self.ledger.stop()
+            try:
+                self._note_tries()  # of the cells that began since the last look
+            finally:
+                self.ledger.stop()
 
     def folder_of(self, cell: Cell) -> Path:
         return self.folder / CELLS / cell.name
