@@ -17,7 +17,7 @@ GPU_PIP = $(GPU_VENV)/bin/python -m pip install --quiet --disable-pip-version-ch
 .PHONY: run test test-lowest test-highest lint types bench gpu clean
 
 run: $(STAMP)
-	$(BIN)/python -m recipes.half_cheetah --preset quick
+	$(BIN)/coim run half_cheetah --preset quick
 
 # One thread: threads that wait for each other in tiny products collapse when another process wants the same cores.
 test: lint types
@@ -31,7 +31,7 @@ test-lowest test-highest: test-%:
 	$(PYTHON) -m venv --clear .venv-$*
 	{ $(FLOORS); } > .venv-$*/constraints.txt
 	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt "torch$(if $(TORCH),==$(TORCH))"
-	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt -e '.[recipes,study,dev]'
+	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt -e '.[experiments,dev]'
 	.venv-$*/bin/python -m pip list --disable-pip-version-check
 	OMP_NUM_THREADS=1 .venv-$*/bin/python -m pytest $(TESTS)
 
@@ -55,13 +55,13 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"coim needs Python >= 3.11, $(PYTHON) is {sys.version.split()[0]}; try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[recipes,study,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[experiments,dev]'
 	@touch $@
 
 $(BENCH_STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check "$$(grep '^torch==' constraints.txt)"
-	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[recipes]' $(RIVALS)
+	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[experiments]' $(RIVALS)
 	@touch $@
 
 # torch, built for CUDA, is found where PYTHON has it, be that a system's folder or another environment's.

@@ -1,3 +1,5 @@
 """What is fast, as ratios that are measured side by side in one run: ``python -m benchmarks``."""
 
-import recipes as recipes  # for Ctrl-C while everything else is imported
+from coim.experiments.command import mind_ctrl_c
+
+mind_ctrl_c()  # while everything else is imported

@@ -23,9 +23,9 @@ from benchmarks.model import ensemble, imagination
 from benchmarks.rivals import sb3, sbx
 from benchmarks.search import search
 from benchmarks.updates import torchrl, update
-from recipes.interrupt import on_command_line
-from recipes.machine import available_cores, prepare
-from recipes.writing import dated_file
+from coim.experiments.run.atomic_write import dated_file
+from coim.experiments.run.interrupt import on_command_line
+from coim.experiments.run.machine import available_cores, prepare
 
 Row = Literal[
     "products",

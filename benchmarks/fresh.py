@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.effort import Effort
 from benchmarks.measure import Figure, threads
-from recipes.machine import available_cores, prepare
+from coim.experiments.run.machine import available_cores, prepare
 
 Measurement = Callable[[Effort], list[Figure]]
 

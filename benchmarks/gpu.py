@@ -31,9 +31,9 @@ from benchmarks.parts import replay
 from benchmarks.table import machine
 from benchmarks.updates import our_updates
 from coim import CoAdaptation, EpisodeDone, HopperMorph
-from recipes.machine import available_cores, prepare
-from recipes.parts import build
-from recipes.settings import Settings
+from coim.experiments.run.build import build
+from coim.experiments.run.machine import available_cores, prepare
+from coim.experiments.run.settings import Settings
 
 EFFORT = Effort(repeats=5, long_repeats=2, runs=(1, 16, 64), updates=100)
 TINY = Effort(

@@ -13,9 +13,9 @@ from benchmarks.measure import Figure, Target, interleaved, over
 from benchmarks.parts import update_products
 from benchmarks.updates import too_few_cores
 from coim import EpisodeDone, HalfCheetahMorph
-from recipes.machine import available_cores
-from recipes.parts import build
-from recipes.settings import Settings
+from coim.experiments.run.build import build
+from coim.experiments.run.machine import available_cores
+from coim.experiments.run.settings import Settings
 
 
 def iteration(effort: Effort) -> list[Figure]:

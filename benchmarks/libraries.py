@@ -14,9 +14,9 @@ from benchmarks.floors import Product, alone, flop
 from benchmarks.measure import Figure, interleaved, over, taking, threads
 from benchmarks.parts import model_products, replay, update_products
 from benchmarks.updates import FLOOR, our_updates, plural, too_few_cores
-from coim.learner import Precision
+from coim.experiments.run.machine import available_cores
+from coim.learners.flat_weights import Precision
 from coim.products import Choice, Library, fastest, kind_of_processor
-from recipes.machine import available_cores
 
 MARGIN = 1.05  # of two medians; below it the difference may be the machine's mood
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")

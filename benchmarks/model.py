@@ -14,7 +14,7 @@ from benchmarks.parts import body_sizes, dynamics_learner, model_products, rando
 from benchmarks.updates import FLOOR, PRODUCTS_BY
 from coim import HalfCheetahMorph, NoisyDesigns, WorldModelEnv, imagine, make_policy, sample_batches
 from coim.imagination import CHUNK_ROWS
-from coim.learner import Precision
+from coim.learners.flat_weights import Precision
 from coim.products import chosen
 
 

@@ -22,7 +22,7 @@ from coim import (
     make_policy,
     make_qvalue,
 )
-from coim.learner import Precision
+from coim.learners.flat_weights import Precision
 
 REPLAY_ROWS = 5_000  # enough that batches differ, few enough for sixteen runs
 

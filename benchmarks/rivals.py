@@ -19,7 +19,7 @@ from benchmarks.measure import Figure, Target, interleaved, over
 from benchmarks.parts import REPLAY_ROWS, body_sizes, replay, update_products
 from benchmarks.updates import our_updates, plural, too_few_cores
 from coim import HalfCheetahMorph
-from recipes.machine import available_cores
+from coim.experiments.run.machine import available_cores
 
 RIVALS = {"sb3": ("stable_baselines3", "Stable-Baselines3"), "sbx": ("sbx", "SBX, scanned")}
 

@@ -15,9 +15,9 @@ from typing import Any
 import torch
 
 from benchmarks.measure import Figure
+from coim.experiments.run.machine import available_cores, words_of
+from coim.experiments.run.provenance import PACKAGES, git_revision
 from coim.products import Choice, chosen
-from recipes.machine import available_cores, words_of
-from recipes.origin import PACKAGES, git_revision
 
 OTHERS = {"stable_baselines3": "stable-baselines3", "sbx": "sbx-rl", "jax": "jax"}
 COLUMNS = ("row", "ratio", "(min - max)", "against", "amount", "target", "met", "note")

@@ -15,10 +15,10 @@ import tyro
 from benchmarks.networks import TRAINED, save
 from coim import EpisodeDone
 from coim.envs import BODIES
-from recipes.interrupt import on_command_line
-from recipes.machine import available_cores, checked_device, prepare
-from recipes.parts import build
-from recipes.settings import Settings
+from coim.experiments.run.build import build
+from coim.experiments.run.interrupt import on_command_line
+from coim.experiments.run.machine import available_cores, checked_device, prepare
+from coim.experiments.run.settings import Settings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -17,9 +17,9 @@ from benchmarks.floors import alone
 from benchmarks.measure import Figure, Target, interleaved, over, threads
 from benchmarks.parts import body_sizes, replay, sac_learner, update_products
 from coim import HalfCheetahMorph, TransitionBuffer, sample_batches
-from coim.learner import Precision
+from coim.experiments.run.machine import available_cores
+from coim.learners.flat_weights import Precision
 from coim.products import chosen, kind_of_processor
-from recipes.machine import available_cores
 
 FLOOR = "floor"
 PRODUCTS_BY = "{:.2f} x the same products by coim.products"

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
         ParticleSwarm,
         RandomDesigns,
     )
-    from coim.dynamics_learner import DynamicsLearner
     from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
     from coim.episode import run_episode
     from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
     from coim.imagination import imagine
-    from coim.learner import SACLearner
+    from coim.learners.dynamics import DynamicsLearner
+    from coim.learners.sac import SACLearner
     from coim.models import (
         GaussianEnsemble,
         NetworkSizes,
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
         select_run,
     )
     from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
-    from coim.saved_run import Agent, SavedRun, TriedDesign, load_run
+    from coim.run_folder import TriedDesign
+    from coim.saved_run import Agent, SavedRun, load_run
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -59,7 +60,7 @@ else:
                 "ParticleSwarm",
                 "RandomDesigns",
             ],
-            "dynamics_learner": ["DynamicsLearner"],
+            "learners.dynamics": ["DynamicsLearner"],
             "envs": [
                 "HalfCheetahMorph",
                 "HopperMorph",
@@ -71,7 +72,7 @@ else:
             "episode": ["run_episode"],
             "events": ["DesignChosen", "DesignDone", "EpisodeDone", "Event"],
             "imagination": ["imagine"],
-            "learner": ["SACLearner"],
+            "learners.sac": ["SACLearner"],
             "models": [
                 "GaussianEnsemble",
                 "NetworkSizes",

@@ -18,13 +18,13 @@ from torchrl.data import Bounded
 
 from coim.buffers import Buffers
 from coim.designs import DesignGenerator, DesignSearch
-from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.simulator_dream import SimulatorDynamics
 from coim.envs.world_model import WorldModelEnv
-from coim.learner import SACLearner
+from coim.learners.dynamics import DynamicsLearner
+from coim.learners.sac import SACLearner
+from coim.learners.written_out import check_exchangeable
 from coim.models.ensemble import GaussianEnsemble
-from coim.written_out import check_exchangeable
 
 PRECISIONS = ("float32", "bfloat16")
 TRIES = 16  # draws of G from each design that is tried

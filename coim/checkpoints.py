@@ -1,4 +1,4 @@
-"""What a checkpoint on disk is, for whoever reads one; `recipes.checkpoint` writes them.
+"""What a checkpoint on disk is, for whoever reads one; `coim.experiments.run.checkpoint` writes them.
 
 A run's ``checkpoint/`` holds a folder of `torchrl.checkpoint` for each of the last two checkpoints. TorchRL gives the
 format and the adapters; the checksums beside them, by which a damaged one is known, are ours.

@@ -1,7 +1,7 @@
 """Algorithm 1: behaviour, design and dynamics learnt together, one body after the other.
 
 `CoAdaptation` is an iterator over events. Its first loop, behaviour and networks, is here, the second one, design, in
-`coim.design_loop`. It draws nothing, logs nothing and stops when nobody asks for the next event; networks, bodies,
+`coim.design_choice`. It draws nothing, logs nothing and stops when nobody asks for the next event; networks, bodies,
 buffers and searches are passed in.
 
 Shapes: U updates, B batch, T steps, K runs, I first designs, D design, S observation.
@@ -37,17 +37,17 @@ from coim.agreement import (
 )
 from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
-from coim.continuation import Trial, restore, state_of
-from coim.design_loop import next_trial
+from coim.continuation import restore, state_of
+from coim.design_choice import Trial, next_trial
 from coim.designs import DesignGenerator, DesignSearch
-from coim.divergence import Divergence
-from coim.dynamics_learner import DynamicsLearner
 from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
 from coim.episode import run_episode
 from coim.events import DesignChosen, DesignDone, EpisodeDone, Event, Kind
 from coim.imagination import imagine
-from coim.learner import SACLearner
+from coim.learners.divergence import Divergence
+from coim.learners.dynamics import DynamicsLearner
+from coim.learners.sac import SACLearner
 
 UPDATES_PER_SAMPLE = 50  # batches drawn in one call: the replay's fixed cost is paid once for all of them
 

@@ -9,38 +9,16 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
-from coim.events import Kind
+from coim.design_choice import Trial
 from coim.randomness import restore_generator
 
 if TYPE_CHECKING:
     from coim.coadaptation import CoAdaptation
-
-
-@dataclass
-class Trial:
-    """A body that is being tried: where the algorithm stands between two of its events.
-
-    Attributes:
-        kind: of the design.
-        design: ``[K, D]``.
-        predicted: Eq. 5 at this design when it was chosen, ``[K]`` on the CPU, or None.
-        best: highest evaluation return so far, ``[K]`` on the CPU; -inf of a run that has none, as one that
-            has diverged before.
-        next_episode: episodes that are over; with 0 the individual learner has not started yet.
-    """
-
-    kind: Kind
-    design: Tensor
-    predicted: Tensor | None
-    best: Tensor
-    next_episode: int = 0
 
 
 def state_of(algorithm: CoAdaptation) -> dict[str, Any]:
@@ -126,31 +104,3 @@ def _if_any(owner: object, method: str, *args: Any) -> Any:
     """Call a method that not every search has."""
     found = getattr(owner, method, None)
     return None if found is None else found(*args)
-
-
-def check_sizes(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
-    """Refuse a state of other networks before anything is copied."""
-    for name, tensor in own.items():
-        if given[name].shape != tensor.shape:
-            raise ValueError(
-                f"the state holds {given[name].numel()} {name}, this learner has {tensor.numel()}; make it with the "
-                "sizes, the number of critics or members and the number of runs that the state was saved with"
-            )
-
-
-def load_moments(optimiser: torch.optim.Optimizer, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
-    """Take the moments of an optimiser of one parameter; none are those of one that has seen nothing.
-
-    In place where there are some: a captured CUDA graph goes on writing to these very moments. Copied where there are
-    none: `torch.optim.Optimizer.load_state_dict` would share them with whoever gave them.
-    """
-    state = optimiser.state[parameter]
-    for moment in state.values():
-        moment.zero_()
-    for name, moment in moments.items():
-        if name in state:
-            state[name].copy_(moment)
-        else:
-            # Adam counts its steps on the CPU, unless it can be captured in a graph.
-            on_gpu = optimiser.defaults.get("capturable", False) or moment.ndim > 0
-            state[name] = moment.detach().to(parameter.device if on_gpu else "cpu", copy=True)

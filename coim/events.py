@@ -25,8 +25,8 @@ class DesignChosen:
         kind: one of the first designs, the optimum of Eq. 5, a random one, or the one body that is fixed throughout.
         design: ``[K, D]``.
         predicted: Eq. 5 at this design before anything is learnt on it, ``[K]``; None while there is no start state.
-        diverged: runs that have diverged, and where (see `coim.divergence`). They keep the body that they have, and
-            their numbers here and in all later events are NaN.
+        diverged: runs that have diverged, and where (see `coim.learners.divergence`). They keep the body that they
+            have, and their numbers here and in all later events are NaN.
     """
 
     index: int

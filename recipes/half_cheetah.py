@@ -1,7 +1,9 @@
-"""Half-Cheetah: six leg segments; ``python -m recipes.half_cheetah --help`` lists every setting."""
+"""Half-Cheetah, six leg segments: the paper's protocol; ``python -m recipes.half_cheetah --help`` lists settings."""
 
-from coim import HalfCheetahMorph
-from recipes.experiment import main
+import sys
+
+from coim.experiments.command import main
 
 if __name__ == "__main__":
-    main(HalfCheetahMorph, "half_cheetah")
+    sys.argv[1:1] = ["run", "half_cheetah"]
+    main()

@@ -1,7 +1,9 @@
-"""Hopper: four segments; ``python -m recipes.hopper --help`` lists every setting."""
+"""Hopper, four segments: the paper's protocol; ``python -m recipes.hopper --help`` lists every setting."""
 
-from coim import HopperMorph
-from recipes.experiment import main
+import sys
+
+from coim.experiments.command import main
 
 if __name__ == "__main__":
-    main(HopperMorph, "hopper")
+    sys.argv[1:1] = ["run", "hopper"]
+    main()

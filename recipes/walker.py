@@ -1,7 +1,9 @@
-"""Walker: torso and six leg segments; ``python -m recipes.walker --help`` lists every setting."""
+"""Walker, torso and six leg segments: the paper's protocol; ``python -m recipes.walker --help`` lists every setting."""
 
-from coim import WalkerMorph
-from recipes.experiment import main
+import sys
+
+from coim.experiments.command import main
 
 if __name__ == "__main__":
-    main(WalkerMorph, "walker")
+    sys.argv[1:1] = ["run", "walker"]
+    main()

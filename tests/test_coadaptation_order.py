@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 from test_coadaptation import STEPS, small
 
-from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation, design_loop
+from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation
+from coim import design_choice as design_loop
 from coim.batches import batch_parts
 
 

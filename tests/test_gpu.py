@@ -61,7 +61,7 @@ def test_an_update_by_a_captured_graph_is_the_eager_one(
     batches = make_rows(20, 32, 3).cuda()
     captured = make()
     with monkeypatch.context() as patched:
-        patched.setattr("coim.flat.captures", lambda device: False)
+        patched.setattr("coim.learners.flat_weights.captures", lambda device: False)
         eager = make()
         eager.update(batches)
     captured.update(batches)

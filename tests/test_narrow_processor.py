@@ -23,9 +23,9 @@ FILES = (
     "tests/objectives/test_gradients.py",
     "tests/objectives/test_dynamics_gradients.py",
     "tests/objectives/test_design.py",
-    "tests/test_learner.py",
-    "tests/test_dynamics_learner.py",
-    "tests/recipes/test_choice_of_products.py",
+    "tests/learners/test_sac_learner.py",
+    "tests/learners/test_dynamics_learner.py",
+    "tests/experiments/run/test_choice_of_products.py",
 )
 KIND = "from coim.products import chosen, kind_of_processor; print(kind_of_processor(), *chosen())"
 

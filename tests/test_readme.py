@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from coim import HopperMorph
-from recipes.experiment import run
-from recipes.settings import Settings
+from coim.experiments.run.settings import Settings
+from coim.experiments.train import run
 
 README = Path(__file__).parents[1] / "README.md"
 SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)

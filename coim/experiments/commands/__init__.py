@@ -1,0 +1,1 @@
+"""The words of the command ``coim``, one module each."""

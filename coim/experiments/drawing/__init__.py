@@ -1,0 +1,1 @@
+"""Colours, layouts, drawn bodies and films."""

@@ -1,0 +1,160 @@
+"""Fig. 1 and Fig. 3: best return of each design over the order of building, every environment, task and arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from coim.experiments.drawing.palette import GREY, put_legend
+from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.statistics.intervals import RESAMPLES, Statistic, iqm, mean, over_runs
+from coim.experiments.study import arms as styles
+from coim.experiments.study.runs import Place, Run, Runs, read_runs
+
+FIGURES = {
+    "figure_1_best_returns": ("none", "known"),
+    "figure_3_best_returns": ("none", "known", "noisy", "random"),
+}
+STATISTICS: dict[str, Statistic] = {"mean": mean, "IQM": iqm}
+PANEL = (3.6, 2.3)  # inches
+CAPTION = (
+    "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
+    "over the evaluation episodes on it. After the first designs, which are given, those that maximise Q and random "
+    "ones take turns{exceptions}. Faint: single runs. Strong: mean and interquartile mean (IQM) of those that have "
+    f"reached the design. Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
+    "environment, task and arm). "
+)
+EXCEPTIONS = {"random-bodies": "takes random ones only", "control-only": "has one body all the time"}
+
+
+def plots(study: Path) -> Iterator[Plot]:
+    """Fig. 1, Fig. 3, and all arms together where there are others."""
+    runs = read_runs(study)
+    figures = dict(FIGURES)
+    others = [arm for arm in runs.arms if not any(arm in arms for arms in FIGURES.values())]
+    if others:
+        figures["best_returns_all_arms"] = tuple(runs.arms)
+    for name, arms in figures.items():
+        yield draw(name, runs, [arm for arm in arms if arm in runs.arms])
+
+
+def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
+    """One figure, a panel for each environment, task and statistic."""
+    drawn = [arm for arm in arms if any(run.designs for run in runs.found if run.arm == arm)]
+    if not drawn:
+        return missing(name, f"No run of {' or '.join(arms) or 'its arms'} has finished a design yet.")
+    panels = arranged([place for place in runs.places if {*arms} & {*runs.arms_at(place)}])
+    height = 0.4 + 0.2 * math.ceil(len(drawn) / 4) + PANEL[1] * len(panels)  # a line of the legend has room for four
+    figure = Figure(figsize=(PANEL[0] * len(panels[0]), height), layout="constrained")
+    grid = figure.subplots(len(panels), len(panels[0]), squeeze=False, sharex="col")
+    rows: list[dict[str, object]] = []
+    first: dict[Place, Axes] = {}  # panels of one place share their limits
+    lowest: dict[int, Axes] = {}  # panel with lines of each column
+    for i, (axes, (place, label)) in enumerate(zip(grid.flat, (panel for line in panels for panel in line))):
+        if draw_panel(axes, runs, place, drawn, label, rows):
+            lowest[i % len(panels[0])] = axes
+        else:
+            axes.axis("off")
+            axes.text(0.5, 0.5, f"{', '.join(place)}:\nno design is finished yet", ha="center", va="center",
+                      transform=axes.transAxes)  # fmt: skip
+        axes.sharey(first.setdefault(place, axes))
+    for axes in lowest.values():
+        axes.tick_params(labelbottom=True)
+        axes.set(xlabel="design (number)")
+    entries = styles.handles(drawn)
+    if any(run.diverged for run in runs.found if run.arm in drawn):
+        entries.append(Line2D([], [], marker="x", color=GREY, linestyle="", label="diverged after this design"))
+    put_legend(figure, entries)
+    return Plot(name=name, figure=figure, rows=rows, caption=caption_of(drawn) + runs.in_words(arms, counted=True))
+
+
+def caption_of(arms: Sequence[str]) -> str:
+    """What is seen of these arms."""
+    told = ", ".join(f"{arm} {words}" for arm, words in EXCEPTIONS.items() if arm in arms)
+    return CAPTION.format(exceptions=f" ({told})" if told else "")
+
+
+def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:
+    """Lines of panels: environments side by side, mean above IQM; of one environment alone these two side by side."""
+    environments, tasks = (list(dict.fromkeys(part)) for part in zip(*places))
+    if len(environments) == 1:
+        return [[((environments[0], task), label) for label in STATISTICS] for task in tasks]
+    return [[((environment, task), label) for environment in environments] for task in tasks for label in STATISTICS]
+
+
+def draw_panel(
+    axes: Axes, runs: Runs, place: Place, arms: list[str], label: str, rows: list[dict[str, object]]
+) -> bool:
+    """Runs and one statistic of every arm; adds what it drew to the rows, and says whether there was anything."""
+    environment, task = place
+    failure = runs.failure(place)
+    for arm in arms:
+        own = [run for run in runs.of(place, arm) if run.designs or (run.diverged and math.isfinite(failure))]
+        if not own:
+            continue
+        longest = max(run.num_designs for run in own)
+        for run in own:
+            draw_run(axes, run)
+        values = best_returns(own, longest, failure)
+        value, low, high, count = over_runs(values, STATISTICS[label])
+        x, shown = np.arange(1, longest + 1), count > 0
+        axes.plot(x, value, linewidth=1.6, zorder=3, marker="o" if shown.sum() == 1 else "", **styles.style(arm))
+        axes.fill_between(x, low, high, color=styles.style(arm)["color"], alpha=0.1, linewidth=0, zorder=2)
+        for end in (low, high):
+            axes.plot(x, end, linewidth=0.5, zorder=2, **styles.style(arm))
+        head: dict[str, object] = {"environment": environment, "task": task, "arm": arm, "series": label}
+        for i in np.flatnonzero(shown):
+            numbers = {"best_return": value[i], "low": low[i], "high": high[i], "runs": int(count[i])}
+            rows.append(head | {"seed": "", "run": "", "design": int(x[i])} | numbers)
+        if label == "mean":  # the single runs are the same in both panels
+            rows += [row for run in own for row in rows_of(run)]
+    if axes.lines:
+        axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design,\n{label} (1)")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    return bool(axes.lines)
+
+
+def best_returns(own: Sequence[Run], longest: int, failure: float) -> np.ndarray:
+    """Best returns of the runs of one arm, ``[R, M]``, NaN where they are still to come.
+
+    What a diverged run counts on a design that it did not reach is left out as long as a run under way has not reached
+    that design either: it would be all that the arm has there.
+    """
+    values = np.full((len(own), longest), math.nan)
+    for line, run in zip(values, own):
+        line[: run.num_designs] = run.best_returns(failure)
+    under_way = [run.state == "under way" for run in own]
+    awaited = np.isnan(values[under_way]).any(0)
+    for line, run in zip(values, own):
+        if run.diverged:
+            line[awaited & (np.arange(longest) >= len(run.designs))] = math.nan
+    return values
+
+
+def draw_run(axes: Axes, run: Run) -> None:
+    """A faint line through what the run reached, with a cross where it diverged."""
+    if not run.designs:
+        return
+    x, y = zip(*sorted((row["design"], row["best_return"]) for row in run.designs))
+    colour = styles.style(run.arm)["color"]
+    axes.plot(x, y, color=colour, linewidth=0.6, alpha=0.25, zorder=1)
+    if run.diverged:
+        axes.plot(x[-1:], y[-1:], color=colour, marker="x", linestyle="", zorder=4)
+
+
+def rows_of(run: Run) -> list[dict[str, object]]:
+    """The line of a single run."""
+    head = {"environment": run.environment, "task": run.task, "arm": run.arm, "series": "run"}
+    head |= {"seed": run.seed, "run": run.number}
+    last = {"low": "", "high": "", "runs": 1}
+    return [
+        head | {"design": row["design"], "best_return": row["best_return"]} | last
+        for row in sorted(run.designs, key=lambda row: row["design"])
+    ]

@@ -1,0 +1,120 @@
+"""Fig. 4(b): how the next state changes with the body, predicted and true, over two components of the design space.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Sec. 6.5 and Fig. 4(b).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+
+from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.palette import CIRCLE, put_legend
+from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.model_error.design_space import FILE, LAYOUT
+from coim.experiments.model_error.placed_simulator import IN_THE_FLOOR
+from coim.experiments.model_error.tables import FOLDER, Kind, Row, folders_with, name_of
+from coim.tables import read_cells
+
+SOURCES = {"delta": "model of changes", "next": "model of next states", "simulator": "simulator"}
+STEM = "figure_4b_design_space"
+SHOWN = (1e-3, 1e2)  # variances of one-step changes; beyond, colours end
+
+
+def plots(study: Path) -> Iterator[Plot]:
+    """A row of panels for each state: two models and the simulator; of each kind of run its first folder by name."""
+    found = folders_with(study, FILE)
+    if not found:
+        line = f"coim model-error ENVIRONMENT --out {study / FOLDER}"
+        yield missing(STEM, f"No model was looked into at the end of its run: {line}")
+    for kind, (folder, *others) in found.items():
+        name, rows = name_of(STEM, kind, found), read_cells(folder / FILE, LAYOUT)
+        caption = describe(kind, rows) + " " + told_of(folder, others, study)
+        yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption)
+
+
+def drawn(rows: Sequence[Row]) -> Figure:
+    """A line of panels for each state, a column for each source."""
+    states = sorted({int(row["state"]) for row in rows})
+    figure, grid = new_figure(1.0 + 1.7 * len(states), len(states), len(SOURCES))
+    panels = iter(grid)
+    for state in states:
+        own = [row for row in rows if int(row["state"]) == state]
+        line = [next(panels) for _ in SOURCES]
+        for axes, (source, title) in zip(line, SOURCES.items()):
+            mesh = draw(axes, own, source)
+            axes.set_title(title if state == states[0] else "", fontsize=10)
+        line[0].set(ylabel=f"state {state}\ncomp. 2 (1)")
+    for axes in line:
+        axes.set(xlabel="component 1 (1)")
+    bar = figure.colorbar(mesh, ax=grid, extend="both", shrink=0.8)
+    bar.set_label("squared change of the next state\n(variances of one-step changes, 1)")
+    put_legend(figure, handles())
+    return figure
+
+
+def draw(axes: Axes, rows: Sequence[Row], source: str) -> QuadMesh:
+    """One state and one source: colours over the plane, hatched where the state is impossible."""
+    grid = [row for row in rows if row["point"] == "grid"]
+    x, y = (np.unique([float(row[key]) for row in grid]) for key in ("pc_1", "pc_2"))
+    shape = (len(y), len(x))
+    change, depth = np.full(shape, np.nan), np.full(shape, np.nan)
+    for row in grid:
+        at = np.searchsorted(y, float(row["pc_2"])), np.searchsorted(x, float(row["pc_1"]))
+        change[at], depth[at] = float(row[f"normalised/{source}"]), float(row["depth"])
+    norm = LogNorm(*SHOWN, clip=True)
+    mesh = axes.pcolormesh(x, y, change, norm=norm, cmap="cividis", shading="nearest", rasterized=True)
+    if (depth > IN_THE_FLOOR).any():
+        axes.contourf(x, y, depth, levels=[IN_THE_FLOOR, np.inf], colors="none", hatches=["////"])
+        axes.contour(x, y, depth, levels=[IN_THE_FLOOR], colors="white", linewidths=0.8)
+    tried = [(float(row["pc_1"]), float(row["pc_2"])) for row in rows if row["point"] == "tried"]
+    around = [withStroke(linewidth=2, foreground="grey")]  # a cross may lie beyond the plane's bounds, on white
+    axes.plot(*zip(*tried), "x", color="white", markersize=3.5, markeredgewidth=0.8, path_effects=around)
+    axes.plot(0, 0, "o", clip_on=False, **CIRCLE)
+    axes.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    return mesh
+
+
+def handles() -> list[Line2D | Patch]:
+    """The legend: what is marked."""
+    return [
+        Line2D([], [], marker="o", linestyle="", label="the state's own design", **CIRCLE),
+        Line2D([], [], marker="x", linestyle="", color="grey", markersize=4, label="designs tried, projected"),
+        Patch(facecolor="lightgrey", edgecolor="black", hatch="////", label="state impossible: body in the floor"),
+    ]
+
+
+def describe(kind: Kind, rows: Sequence[Row]) -> str:
+    """What is seen, and how far the models are from the simulator where the state is possible."""
+    grid = [row for row in rows if row["point"] == "grid"]
+    deep = np.array([float(row["depth"]) > IN_THE_FLOOR for row in grid])
+    change = {source: np.array([float(row[f"normalised/{source}"]) for row in grid]) for source in SOURCES}
+    medians = []
+    for words, chosen in (("possible", ~deep), ("impossible", deep)):
+        if chosen.any():
+            told = ", ".join(f"{source} {np.nanmedian(values[chosen]):.3g}" for source, values in change.items())
+            medians.append(f"where the state is {words}: {told}")
+    shares = ", ".join(f"{float(rows[0][key]):.0%}" for key in ("share_1", "share_2"))
+    return (
+        f"Squared change of the next state on {kind.environment}, {kind.task}, {kind.designs} designs, when the design "
+        "alone changes, for stored states and actions drawn at random among those whose plane has an area within the "
+        "bounds. The axes are the first two principal components of the designs tried, in scale factors "
+        f"({shares} of their variance), drawn through the state's own design; white is out of bounds. Hatched: more "
+        f"than {IN_THE_FLOOR * 100:.0f} cm of the body would be in the floor. Medians {'; '.join(medians)}."
+    )
+
+
+def told_of(folder: Path, others: Sequence[Path], study: Path) -> str:
+    """Whose models these are, and which runs are not drawn."""
+    first, *rest = (path.relative_to(study).as_posix() for path in (folder, *others))
+    return f"Of {first}" + (f", the first by name; not drawn: {', '.join(rest)}." if rest else ".")

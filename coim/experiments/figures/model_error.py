@@ -1,0 +1,200 @@
+"""Fig. 4(a): error of the learnt dynamics over training, on what they have seen and on what they have not.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Sec. 6.5 and Fig. 4(a).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.palette import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, put_legend
+from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.model_error.algorithm import FILE, LAYOUT
+from coim.experiments.model_error.tables import (
+    FOLDER,
+    LAST,
+    Kind,
+    curves,
+    differences,
+    first_late_step,
+    folders_with,
+    late_share,
+    name_of,
+    with_shares,
+)
+from coim.experiments.report.curves import STEPS
+from coim.experiments.statistics.intervals import RESAMPLES
+from coim.run_folder import read_config
+from coim.tables import read_cells
+
+Rows = Sequence[dict[str, object]]
+
+# Colour, dashes, mark and words of each thing that is measured.
+PROBES = {
+    "seen": (VERMILION, "-", "", "designs seen, held-out episodes"),
+    "next": (BLACK, "", "^", "next design before it is learnt on"),
+    "never built": (BLUE, "-", "", "designs never built, own episodes"),
+    "noisy": (ORANGE, "-", "", "stored states, noisy designs"),
+    "noisy possible": (ORANGE, ":", "", "noisy designs, not in the floor"),
+    "random": (GREEN, "-", "", "stored states, random designs"),
+    "random possible": (GREEN, ":", "", "random designs, not in the floor"),
+}
+MODELS = {"delta": "learns the change", "next": "learns the next observation"}
+UNITS = {
+    "share": "share of the change\nthat is not explained (1)",
+    "mse": "squared error, raw\n(m, rad, m/s, rad/s, squared)",
+}
+MOST = 3.0  # share up to which panels reach: first models err by hundreds, and would press the rest flat
+STEM = "figure_4a_model_error"
+
+
+def plots(study: Path) -> Iterator[Plot]:
+    """Error over training for each kind of run that was measured, a panel for each model and each unit."""
+    found = folders_with(study, FILE)
+    if not found:
+        line = f"coim model-error ENVIRONMENT --out {study / FOLDER}"
+        yield missing(STEM, f"No model error was measured: {line}")
+    for kind, folders in found.items():
+        name = name_of(STEM, kind, found)
+        rows = [row for folder in folders for row in rows_of(folder, study)]
+        if not rows:
+            yield missing(name, f"There is no measurement yet in {' and '.join(str(x / FILE) for x in folders)}.")
+            continue
+        yield Plot(name=name, figure=drawn(rows), rows=behind(rows), caption=describe(kind, rows, folders))
+
+
+def rows_of(folder: Path, study: Path) -> list[dict[str, object]]:
+    """What was measured in a folder, with its name and its seed."""
+    seed = read_config(folder)["settings"].get("seed", 0)
+    return with_shares(read_cells(folder / FILE, LAYOUT), folder.relative_to(study).as_posix(), seed)
+
+
+def drawn(rows: Rows) -> Figure:
+    """A line of panels for each unit, a column for each model."""
+    figure, grid = new_figure(6.4, len(UNITS), len(MODELS), sharex=True)
+    panels = iter(grid)
+    for unit, words in UNITS.items():
+        pair = [next(panels) for _ in MODELS]
+        for axes, (model, title) in zip(pair, MODELS.items()):
+            draw(axes, rows, model, unit)
+            axes.set(title=title if unit == "share" else "")
+        low, high = (f(axes.get_ylim()[i] for axes in pair) for i, f in enumerate((min, max)))
+        for axes in pair:
+            axes.set(ylim=(low, min(high, MOST) if unit == "share" else high))
+        pair[0].set(ylabel=words)
+    for axes in grid[-len(MODELS) :]:
+        axes.set(xlabel=STEPS)
+    put_legend(figure, list(handles({str(row["probe"]) for row in rows})))
+    return figure
+
+
+def draw(axes: Axes, rows: Rows, model: str, unit: str) -> None:
+    """One model in one unit: for each probe the mean over runs, with its interval and the runs where there are several.
+
+    The mean's line has the probe's name as its label.
+    """
+    for probe, (colour, dashes, mark, _) in PROBES.items():
+        found = curves(rows, probe, model, unit)
+        style = {"color": colour, "linestyle": dashes or "none"}
+        for run in found.runs if len(found.runs) > 1 else ():
+            there = np.isfinite(run)
+            faint = style | {"marker": mark, "markersize": 2.5, "linewidth": 0.6, "alpha": 0.25, "zorder": 1}
+            axes.plot(found.steps[there], run[there], label=f"_{probe}", **faint)
+        x, value, low, high, _ = found.mean()
+        lone = mark or ("o" if len(x) == 1 else "")
+        axes.plot(x, value, label=probe, marker=lone, markersize=4, linewidth=1.3, zorder=3, **style)
+        if mark:
+            axes.vlines(x, low, high, color=colour, linewidth=0.8, zorder=2)
+        else:
+            axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0, zorder=2)
+    if unit == "share":
+        axes.axhline(1, label="no change", color=GREY, linestyle="--", linewidth=1)
+    axes.set(yscale="log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if unit == "share" else (1, 3), numticks=20))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+
+
+def handles(measured: set[str]) -> Iterator[Line2D]:
+    """Entries of the legend for what was measured."""
+    for probe, (colour, dashes, mark, words) in PROBES.items():
+        if probe in measured:
+            yield Line2D([], [], color=colour, linestyle=dashes or "none", marker=mark, markersize=4, label=words)
+    yield Line2D([], [], color=GREY, linestyle="--", linewidth=1, label="predicting no change")
+
+
+def behind(rows: Rows) -> list[dict[str, object]]:
+    """The CSV file: the rows of every run, and where there are several the mean and its interval at each step."""
+    ends = [f"{unit}_{end}" for unit in UNITS for end in ("low", "high")]
+    nothing = dict.fromkeys([*rows[0], *ends], "")
+    found = [{"series": "run", **nothing, **row, "runs": 1} for row in rows]
+    if len(names_of(rows)) == 1:
+        return found
+    for probe in PROBES:
+        for model in MODELS:
+            means: dict[int, dict[str, object]] = {}
+            for unit in UNITS:
+                for step, value, low, high, count in zip(*curves(rows, probe, model, unit).mean()):
+                    numbers = {unit: value, f"{unit}_low": low, f"{unit}_high": high, "runs": int(count)}
+                    means.setdefault(int(step), {}).update(numbers)
+            head = {"series": "mean", **nothing, "probe": probe, "predict": model}
+            found += [head | {"env_steps": step} | numbers for step, numbers in sorted(means.items())]
+    return found
+
+
+def names_of(rows: Rows) -> set[tuple[object, object]]:
+    """Folder and number of each run."""
+    return {(row["folder"], row["run"]) for row in rows}
+
+
+def describe(kind: Kind, rows: Rows, folders: Sequence[Path]) -> str:
+    """What is seen, with the share of each probe over the last part of training."""
+    runs = len(names_of(rows))
+    last = []
+    for model, words in MODELS.items():
+        shares = {probe: late_share(rows, probe, model) for probe in PROBES}
+        told = [f"{probe} {in_words(*share)}" for probe, share in shares.items() if np.isfinite(share[0])]
+        last.append(f"a model that {words}: {', '.join(told)}")
+    return (
+        f"Squared error of the ensemble's mean prediction over training on {kind.environment}, {kind.task}, "
+        f"{kind.designs} designs, {runs} run(s); both models learn from the same batches. Seen: one more episode of "
+        "each design, by the individual policy that learnt on it. Next and never built: episodes by pi_Pop, the "
+        "population's policy, of that time; so they differ from seen in their bodies and in their policies. Runs that "
+        "diverge are measured until then. Above: the error as a share of that of predicting no change on the same "
+        "transitions, each entry of the observation in units of the variance of its one-step changes in the replay; a "
+        f"model at 1 knows nothing of the change, panels end at {MOST:g}. Below: the error in the raw units of "
+        "the observation, as the paper prints it; the less the states of a probe move, the smaller it is. "
+        f"{of_several(rows, folders) if runs > 1 else ''}Shares over the last {LAST:.0%} of training (after step "
+        f"{first_late_step(rows):,}), the sum of a run's errors over the sum of those of predicting no change"
+        f"{', mean over runs' if runs > 1 else ''}: {'; '.join(last)}."
+    )
+
+
+def in_words(value: float, low: float, high: float) -> str:
+    """A number, with its interval where there is one."""
+    return f"{value:.3g}" + (f" ({low:.3g} to {high:.3g})" if np.isfinite(low) else "")
+
+
+def of_several(rows: Rows, folders: Sequence[Path]) -> str:
+    """Sentences on how runs were joined."""
+    told = (
+        "Faint: single runs. Strong: their mean. Bands and bars: pointwise 95 % intervals of the bootstrap over runs "
+        f"({RESAMPLES} resamples). "
+    )
+    every = [curves(rows, probe, model, "mse") for probe in PROBES for model in MODELS]
+    if any(not found.shared.all() for found in every):
+        told += "The mean is drawn at the steps at which all runs that had got so far have a number. "
+    if different := differences(folders):
+        told += f"The runs differ in more than their seed: {', '.join(different)}. "
+    return told

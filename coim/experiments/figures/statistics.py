@@ -1,0 +1,234 @@
+"""Statistics of a study: each arm, each pair of arms, each prediction, and what each run took."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.palette import BLACK, GREY, put_legend
+from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, interval, iqm, mean
+from coim.experiments.statistics.measures import MEASURES, Cells, Measured, comparisons, limits, measure, predictions
+from coim.experiments.study import arms as styles
+from coim.experiments.study.runs import Place, Runs, read_runs
+
+LABELS = {"area": "area: mean best return\nof a design (1)", "final": "final: highest\nbest return (1)"}
+ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not"
+OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
+INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
+
+
+def plots(study: Path) -> Iterator[Plot]:
+    """Arms, pairs of arms, predictions, runs."""
+    runs = read_runs(study)
+    measured = [measure(run, runs.failure((run.environment, run.task))) for run in runs.found]
+    yield arms(runs, measured)
+    yield pairs(runs, measured)
+    yield predicted(runs)
+    yield spent(runs, measured)
+
+
+def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
+    """Area and final best return of every arm, and everything else that is said of an arm, as a table."""
+    rows, places = [], []
+    for place in runs.places:
+        own = [m for m in measured if (m.run.environment, m.run.task) == place]
+        if any(m.run.over and math.isfinite(m.final) for m in own):
+            places.append(place)
+            rows += [summary(runs, place, arm, [m for m in own if m.run.arm == arm]) for arm in runs.arms_at(place)]
+    if not places:
+        return missing("statistics_arms", f"No run has tried all its designs yet. {runs.in_words(runs.arms)}")
+    figure, grid = new_figure(0.4 + (2.4 + room_for_names(runs.arms)) * len(places), len(places), len(MEASURES))
+    axes_of = iter(grid)
+    for place in places:
+        for name in MEASURES:
+            draw_arms(next(axes_of), runs, place, name, measured)
+    caption = (
+        "Runs that have tried all their designs, or diverged: points. Bars: interquartile means (IQM) and their "
+        f"intervals; ticks: means. {INTERVALS}area: the mean over designs of a design's best return; final: the "
+        "highest of all designs. search_gain: mean best return of the designs that maximised Q minus that of the "
+        "random ones, which take turns with them, mean over runs. This and what follows, up to bias, is of the designs "
+        "that a run reached, and _runs the number of runs that have a value. rank_correlation: Spearman's, of Q(xi) "
+        "before a body was built and the best return on it, over the bodies after the first ones, mean over runs; "
+        "_given_order: the partial one with the order of building held fixed, as Q and returns both rise while the "
+        "networks learn. bias: (1 - gamma) Q(xi) - best return / steps, both a reward per step, equal if the reward is "
+        f"constant, of bodies that maximised Q and of the random ones; {ENTROPY}. diverged_share: of the runs that "
+        "have begun. hours: wall-clock of a run's cell; hours and updates: mean over runs. "
+        f"{runs.in_words(runs.arms, counted=True)}"
+    )
+    return Plot(name="statistics_arms", figure=figure, rows=rows, caption=caption, readable=True)
+
+
+def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cells:
+    """A row of the table of arms."""
+    over = [m for m in own if m.run.over]
+    diverged = sum(m.run.diverged for m in own)
+    row: Cells = {"environment": place[0], "task": place[1], "arm": arm, "planned": runs.planned[*place, arm]}
+    row |= {"over": len(over), "diverged": diverged, "diverged_share": diverged / len(own) if own else np.nan}
+    for name in MEASURES:
+        values = np.array([getattr(m, name) for m in over])
+        row |= {f"{name}_mean": float(mean(values)) if over else np.nan}
+        row |= {f"{name}_iqm": float(iqm(values)) if over else np.nan} | limits(f"{name}_iqm", iqm, values)
+    for name in OF_SEARCH:
+        values = np.array([getattr(m, name.removeprefix("rank_")) for m in over])
+        values = values[np.isfinite(values)]
+        row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
+        row |= {f"{name}_runs": values.size}
+    for name in ("hours", "updates"):
+        row[name] = float(np.mean([getattr(m, name) for m in over])) if over else np.nan
+    return row
+
+
+def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequence[Measured]) -> None:
+    """One measure of every arm of one environment and task."""
+    for x, arm in enumerate(runs.arms_at(place)):
+        here = [m for m in measured if (m.run.environment, m.run.task) == place and m.run.arm == arm and m.run.over]
+        values, colour = np.array([getattr(m, name) for m in here]), styles.style(arm)["color"]
+        if not here:
+            continue
+        spread = x + np.linspace(-0.22, 0.22, len(here) + 2)[1:-1]
+        axes.scatter(spread, values, s=12, color=colour, marker=styles.MARKERS.get(arm, "o"), alpha=0.6, linewidth=0)
+        low, high = interval(iqm, values)
+        axes.vlines(x, low, high, color=colour, linewidth=2.5)
+        axes.hlines(iqm(values), x - 0.3, x + 0.3, color=colour, linewidth=2.5)
+        axes.hlines(mean(values), x - 0.3, x - 0.18, color=BLACK, linewidth=1)
+    name_arms(axes, runs.arms_at(place))
+    axes.set(ylabel=LABELS[name], title=", ".join(place))
+
+
+def name_arms(axes: Axes, arms: Sequence[str]) -> None:
+    """Names below the columns; slanted where there is no room for them side by side."""
+    slanted = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if room_for_names(arms) else {}
+    axes.set_xticks(range(len(arms)), arms, **slanted)
+
+
+def room_for_names(arms: Sequence[str]) -> float:
+    """Inches that slanted names take from a panel; none where they stand side by side."""
+    return 0.5 * (len(arms) > 4)
+
+
+def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
+    """Probability of improvement of every pair of arms that is compared, with the tests as a table."""
+    rows = comparisons(runs, measured)
+    if not rows:
+        return missing("statistics_pairs", f"No two arms have runs that are over. {runs.in_words(runs.arms)}")
+    figure, grid = new_figure(0.9 + 0.26 * max(4, len(rows) // 2), 1, len(MEASURES))
+    for axes, name in zip(grid, MEASURES):
+        own = [row for row in rows if row["measure"] == name]
+        for y, row in enumerate(reversed(own)):
+            paint = {"color": styles.style(str(row["arm"]))["color"]}
+            axes.plot([row["improvement_low"], row["improvement_high"]], [y, y], linewidth=2, **paint)
+            axes.plot(row["improvement"], y, marker=styles.MARKERS.get(str(row["arm"]), "o"), **paint)
+        labels = ["{arm} over {against}\n{environment}, {task}".format(**row) for row in reversed(own)]
+        axes.axvline(0.5, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
+        axes.set(xlim=(-0.03, 1.03), ylim=(-0.7, len(own) - 0.3), xlabel="probability of improvement (1)")
+        axes.set(title=name, yticks=range(len(own)), yticklabels=labels if name == MEASURES[0] else [])
+        axes.tick_params(axis="y", labelsize=7)
+    caption = (
+        "Probability that a run of one arm ends above a run of the other, ties counting half, by the area under the "
+        f"best-return curve and by the highest best return; 1 means that no run of the other was above one of it, "
+        f"which few runs often show by chance. {INTERVALS}all: the mean over the environments and tasks in which both "
+        "arms have runs, each resampled by itself. difference and welch_p: of the arms, Welch's t-test, two-sided; "
+        "detectable: the difference that it finds (p below 0.05, uncorrected) in 80% of studies with these spreads and "
+        "numbers of runs; paired_difference and paired_p: of the runs that share their seed, paired t-test (with five "
+        "pairs Wilcoxon's test cannot go below 0.0625); _holm: corrected by Holm over all tests of that kind by that "
+        f"measure in this table. {runs.in_words(runs.arms, counted=True)}"
+    )
+    return Plot(name="statistics_pairs", figure=figure, rows=rows, caption=caption, readable=True)
+
+
+def predicted(runs: Runs) -> Plot:
+    """Q(xi) before a body was built against the best return on it, both as reward per step."""
+    rows: list[Cells] = []
+    places = [
+        place for place in runs.places if any(predictions(run) for arm in runs.arms for run in runs.of(place, arm))
+    ]
+    if not places:
+        return missing("statistics_predictions", "No design has both a prediction and a best return yet.")
+    lines, columns = (len(places) + 1) // 2, min(2, len(places))
+    figure, grid = new_figure(0.6 + 3.0 * lines, lines, columns)
+    for axes, place in zip(grid, places):
+        for arm in runs.arms:
+            head = {"environment": place[0], "task": place[1], "arm": arm}
+            own = [
+                head | {"seed": run.seed, "run": run.number} | {key: row[key] for key in PREDICTED}
+                for run in runs.of(place, arm)
+                for row in predictions(run)
+            ]
+            x, y = ([row[key] for row in own] for key in PREDICTED[-2:])
+            paint = {"color": styles.style(arm)["color"], "marker": styles.MARKERS.get(arm, "o")}
+            axes.scatter(x, y, s=12, alpha=0.6, linewidth=0, **paint)
+            rows += own
+        axes.axline((0, 0), slope=1, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
+        axes.set(xlabel=r"$(1 - \gamma)\ Q(\xi)$, reward per step (1)", ylabel="best return / steps (1)")
+        axes.set(title=", ".join(place))
+    for axes in grid[len(places) :]:
+        axes.remove()
+    put_legend(figure, points({str(row["arm"]) for row in rows}))
+    caption = (
+        "Eq. 5 before anything was learnt on a body, against the best return on it, a point for each design. "
+        "(1 - gamma) Q and return / steps are both a reward per step and equal (dashed) if the reward is constant; Q "
+        "weighs the first 1 / (1 - gamma) steps, and is of the population's policy, the return of the best individual "
+        f"one; {ENTROPY}. {runs.in_words(runs.arms)}"
+    )
+    return Plot(name="statistics_predictions", figure=figure, rows=rows, caption=caption)
+
+
+OF_RUN = (
+    "area",
+    "final",
+    "search_gain",
+    "correlation",
+    "correlation_given_order",
+    "bias_optimised",
+    "bias_random",
+    "hours",
+    "episode_seconds",
+    "updates",
+)
+PREDICTED = ("design", "kind", "predicted", "best_return", "predicted_per_step", "return_per_step")
+
+
+def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
+    """Wall-clock and updates of every run, with all that was measured of it as a table."""
+    if not measured:
+        return missing("statistics_runs", f"No run has begun. {runs.in_words(runs.arms)}")
+    rows: list[Cells] = [
+        {"environment": m.run.environment, "task": m.run.task, "arm": m.run.arm, "seed": m.run.seed}
+        | {"run": m.run.number, "state": m.run.state, "designs": len(m.run.designs), "planned": m.run.num_designs}
+        | {name: getattr(m, name) for name in OF_RUN}
+        for m in measured
+    ]
+    places = [place for place in runs.places if any((m.run.environment, m.run.task) == place for m in measured)]
+    figure, grid = new_figure(0.4 + (2.2 + room_for_names(runs.arms)) * len(places), len(places), 2)
+    labels = {"hours": "wall-clock of the cell (h)", "updates": "updates (number)"}
+    for axes, (place, name) in zip(grid, ((place, name) for place in places for name in labels)):
+        here = [m for m in measured if (m.run.environment, m.run.task) == place]
+        for x, arm in enumerate(runs.arms_at(place)):
+            values = [getattr(m, name) for m in here if m.run.arm == arm]
+            spread = x + np.linspace(-0.25, 0.25, len(values) + 2)[1:-1]
+            paint = {"color": styles.style(arm)["color"], "marker": styles.MARKERS.get(arm, "o")}
+            axes.scatter(spread, values, s=14, alpha=0.7, linewidth=0, **paint)
+        name_arms(axes, runs.arms_at(place))
+        axes.set(ylabel=labels[name], title=", ".join(place))
+        axes.set_ylim(0, 1.1 * max(getattr(m, name) for m in here))
+    caption = (
+        "What every run took, also those under way: wall-clock of its cell, whatever else the machine did meanwhile, "
+        "and updates of both learners and the ensemble together. episode_seconds: the median over its episodes, with "
+        f"their updates and evaluation. {runs.in_words(runs.arms)}"
+    )
+    return Plot(name="statistics_runs", figure=figure, rows=rows, caption=caption)
+
+
+def points(names: set[str]) -> list[Line2D]:
+    """Entries of a legend: marks."""
+    return [
+        Line2D([], [], color=styles.style(arm)["color"], marker=styles.MARKERS.get(arm, "o"), linestyle="", label=arm)
+        for arm in styles.in_order(names)
+    ]

@@ -1,0 +1,151 @@
+"""Draw the figures of archived studies, and the page that shows them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+
+from coim.experiments.figures import best_returns as returns
+from coim.experiments.figures import cartpole, design_space, model_error, retrained, statistics
+from coim.experiments.figures.figure import Plot
+from coim.experiments.model_error.tables import FOLDER
+from coim.experiments.report.page import FONT
+from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, written_aside
+from coim.experiments.run.progress import counted
+from coim.experiments.run.records import number
+from coim.experiments.statistics.intervals import FEW
+from coim.run_folder import read_config
+
+MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
+OF_MODELS = (model_error, design_space, cartpole)  # what a folder without cells has, Fig. 4
+SUFFIXES = ("png", "pdf", "csv", "md")
+TITLE = "# Figures of "
+RESOLUTION = 150  # dots per inch of a PNG
+
+
+def write_figures(study: Path, out: Path | None = None) -> list[Plot]:
+    """Write every figure that has something to show.
+
+    Args:
+        study: its folder.
+        out: folder for the figures; by default ``figures/`` in the study's.
+
+    Returns:
+        The plots, also those that have no figure because their input is not there.
+
+    Raises:
+        ValueError: if the folder is no study's, nor has a measured run, or that for the figures holds a page of
+            somebody else.
+        OSError: if the figures cannot be written.
+    """
+    folder, found = out or study / "figures", []
+    before = drawn_before(folder)
+    measured_only = (study / FOLDER).is_dir() and not (study / "cells").is_dir()
+    modules = OF_MODELS if measured_only else MODULES
+    with mpl.rc_context(FONT), naming_out(folder):
+        for module in counted(modules, len(modules), "figures: parts"):
+            for plot in module.plots(study):
+                folder.mkdir(parents=True, exist_ok=True)
+                write_plot(folder, plot)
+                found.append(plot)
+        for name in before - {plot.name for plot in found}:
+            remove(folder, name)
+        write_whole(folder / "README.md", page(study, found))
+    return found
+
+
+def drawn_before(folder: Path) -> set[str]:
+    """Names of the plots of an earlier drawing, which may have been called otherwise: by its page.
+
+    Raises:
+        ValueError: if the page that is there is no page of figures.
+    """
+    path = folder / "README.md"
+    if not path.is_file():
+        return set()
+    there = path.read_text(encoding="utf-8")
+    if not there.startswith(TITLE):
+        raise ValueError(f"{path} is no page of figures and would be written over; name another folder with --out")
+    return set(re.findall(r"^## (\w+)$", there, re.MULTILINE))
+
+
+def remove(folder: Path, name: str) -> None:
+    """Take away the files of one plot."""
+    for suffix in SUFFIXES:
+        (folder / f"{name}.{suffix}").unlink(missing_ok=True)
+
+
+def write_plot(folder: Path, plot: Plot) -> None:
+    """The files of one plot; those of an earlier drawing that has nothing to show any more are removed."""
+    files = {suffix: folder / f"{plot.name}.{suffix}" for suffix in SUFFIXES}
+    remove(folder, plot.name)
+    if plot.figure is None:
+        return
+    with written_aside(files["png"]) as aside:
+        plot.figure.savefig(aside, dpi=RESOLUTION)
+    with written_aside(files["pdf"]) as aside:
+        plot.figure.savefig(aside, metadata={"CreationDate": None})
+    rows = ({key: cell(value, digits=7) for key, value in row.items()} for row in plot.rows)
+    write_whole(files["csv"], as_csv(list(plot.rows[0]), rows))
+    if plot.readable:
+        write_whole(files["md"], f"{plot.caption}\n\n{table(plot.rows)}")
+
+
+def page(study: Path, plots: Iterable[Plot]) -> str:
+    """All figures with their captions, in Markdown."""
+    lines = [
+        f"{TITLE}{study.resolve().name}",
+        "",
+        f"Written by `coim figures`. {FEW}",
+        "",
+    ]
+    lines += [made_by(study), ""] if (study / "cells").is_dir() else []
+    for plot in plots:
+        lines += [f"## {plot.name}", ""]
+        if plot.figure is not None:
+            files = ", ".join(f"[{suffix}]({plot.name}.{suffix})" for suffix in ("pdf", "csv"))
+            lines += [f"![{plot.name}]({plot.name}.png)", "", f"{plot.caption} ({files})", ""]
+            lines += [table(plot.rows), ""] if plot.readable else []
+        else:
+            lines += [f"Not drawn. {plot.caption}", ""]
+    return "\n".join(lines)
+
+
+def made_by(study: Path) -> str:
+    """The code that made the runs; runs of several revisions may be runs of several algorithms.
+
+    Example:
+        >>> made_by(Path("docs/results/preview"))  # doctest: +SKIP
+        'All runs were made at revision 9d69483.'
+    """
+    revisions = Counter(" and ".join(sorted(revisions_of(path.parent))) for path in study.glob("cells/*/config.json"))
+    if len(revisions) < 2:
+        return f"All runs were made at revision {next(iter(revisions), 'unknown')}."
+    told = ", ".join(f"{count} at {revision}" for revision, count in sorted(revisions.items()))
+    return f"**Runs of different revisions are compared: {told}.** `CHANGELOG.md` says what moved results between them."
+
+
+def revisions_of(folder: Path) -> set[str]:
+    """Of the code that began a run and of those that went on with it, where they have noted it."""
+    config = read_config(folder)
+    noted = [config.get("revision"), *(entry.get("revision", "") for entry in config.get("resumed", []))]
+    return {"unknown" if revision is None else revision[:12] for revision in noted if revision != ""}
+
+
+def table(rows: Sequence[Mapping[str, object]]) -> str:
+    """Rows as a Markdown table; numbers with three significant digits."""
+    head = list(rows[0])
+    lines = [head, ["---"] * len(head), *([str(cell(row[key], digits=3)) for key in head] for row in rows)]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def cell(value: object, *, digits: int) -> object:
+    """A number to so many significant digits; an empty cell for one that is not known."""
+    if isinstance(value, float):
+        return ("" if digits > 3 else "-") if math.isnan(value) else number(value, digits)
+    return value

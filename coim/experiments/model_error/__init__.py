@@ -1,0 +1,1 @@
+"""How far the learnt dynamics are from the simulator."""

@@ -1,0 +1,218 @@
+"""Algorithm 1 with a model of each kind beside it, measured while it runs.
+
+Shapes: K runs, N rows.
+
+References:
+    "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Sec. 6.5 and Fig. 4(a).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from coim.batches import sample_mixture
+from coim.coadaptation import UPDATES_PER_SAMPLE, CoAdaptation
+from coim.designs import NoisyDesigns, RandomDesigns
+from coim.events import DesignChosen, EpisodeDone, Event
+from coim.experiments.model_error.errors import change_variance, mean_squares, persistence_error, prediction_error
+from coim.experiments.model_error.test_rows import Probes, joined
+from coim.experiments.run.results import Table
+from coim.learners.dynamics import DynamicsLearner
+from coim.randomness import restore_generator
+from coim.tables import Layout
+
+COLUMNS = ["run", "design", "episode", "env_steps", "probe", "predict", "mse", "normalised", "rows", "impossible"]
+FILE = "model_error.csv"
+LAYOUT = Layout(
+    needed=tuple(COLUMNS), words=("probe", "predict"), counts=("run", "design", "episode", "env_steps", "rows")
+)
+
+
+class ProbedCoAdaptation:
+    """An algorithm that goes on exactly as it would alone, while two models are measured after its episodes.
+
+    One model is the algorithm's own. The other one differs in what it predicts (the change of the observation, or the
+    next one) and in nothing else: the same first weights, and after each episode the same batches of Replay_Pop.
+
+    What is measured, each on ``num_rows`` rows (`seen`: of each design):
+
+    =============  ===========================================================================================
+    seen           an episode of every design so far, taken at its last measurement and kept out of the replay
+    next           an episode of the next design by pi_Pop, before anything was learnt on it
+    never built    episodes of eight uniform designs, by the current pi_Pop
+    noisy, random  states of ``seen`` whose design was swapped for N(xi, sigma^2) or a uniform one
+    ... possible   those of them in which no part of the new body is in the floor
+    =============  ===========================================================================================
+
+    Args:
+        algorithm: which imagines.
+        other: the second learner, made by `other_learner`.
+        probes: what is measured on.
+        folder: of the run; `FILE` grows in it.
+        every: episodes of a design between two measurements; its last episode is always followed by one.
+        sigma: of the noisy designs.
+        seed: of what is drawn for the measurements.
+
+    Note:
+        Everything that is not defined here is the algorithm's, so that whoever follows an algorithm can follow this.
+    """
+
+    def __init__(
+        self,
+        algorithm: CoAdaptation,
+        other: DynamicsLearner,
+        probes: Probes,
+        folder: Path,
+        *,
+        every: int,
+        sigma: float,
+        seed: int,
+    ) -> None:
+        self.algorithm, self.other, self.probes = algorithm, other, probes
+        self.every, self.seed, self.path = every, seed, folder / FILE
+        spec = algorithm.env.design_spec
+        self.swaps = {"noisy": NoisyDesigns(spec, sigma=sigma), "random": RandomDesigns(spec)}
+        self.seen: list[TensorDict] = []  # [R, K] of each design
+        # The other model draws its batches as the algorithm's own does; from the same state on they are the same.
+        self._rng = torch.Generator(algorithm.rngs["model"].device)
+        self._rng.set_state(algorithm.rngs["model"].get_state())
+        self._table: Table | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.algorithm, name)
+
+    @property
+    def learners(self) -> dict[str, DynamicsLearner]:
+        """Both, by what they predict."""
+        return {learner.ensemble.predict: learner for learner in (self.algorithm.dynamics, self.other)}
+
+    @property
+    def updates_per_episode(self) -> int:
+        """The algorithm's, and those of the other model."""
+        return self.algorithm.updates_per_episode + self.algorithm.model_updates
+
+    def __iter__(self) -> Iterator[Event]:
+        if self._table is None:
+            self._table = Table(self.path, COLUMNS)
+        for event in self.algorithm:
+            if isinstance(event, DesignChosen) and event.index > 0:
+                rows = self.probes.trajectory(self.algorithm.population.policy, event.design, seed=self._seed())
+                self._write(event, "next", rows)
+            elif isinstance(event, EpisodeDone):
+                self._learn()
+                first = event.index < len(self.algorithm.first_designs)
+                last = self.algorithm.first_episodes if first else self.algorithm.episodes
+                if (event.episode + 1) % self.every == 0 or event.episode + 1 == last:
+                    self._measure(event)
+            yield event
+
+    def state_dict(self) -> dict[str, Any]:
+        """The algorithm's, and all that the coming measurements depend on."""
+        probed = {
+            "other": self.other.state_dict(),
+            "rng": self._rng.get_state(),
+            "seen": [rows.flatten_keys(".").to_dict() for rows in self.seen],
+            "csv_rows": self._table.num_rows if self._table else 0,
+            "asked": self._asked(),
+        }
+        return {**self.algorithm.state_dict(), "probed": probed}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the one that :meth:`state_dict` was read from; later rows of the CSV file are dropped.
+
+        Raises:
+            ValueError: if the state is of a run that was not probed, or measured otherwise.
+        """
+        if "probed" not in state_dict:
+            raise ValueError(f"nothing was measured in the run of {self.path.parent}; measure a new run")
+        probed = state_dict["probed"]
+        if probed["asked"] != self._asked():
+            raise ValueError(f"the run was measured with {probed['asked']}, not with {self._asked()}; leave them")
+        self.algorithm.load_state_dict(state_dict)
+        self.other.load_state_dict(probed["other"])
+        restore_generator(self._rng, probed["rng"])
+        runs = self.algorithm.env.numel()
+        # Beside those that will be seen, wherever the run was before.
+        saved = [TensorDict(rows, [len(rows["design"]), runs]).unflatten_keys(".") for rows in probed["seen"]]
+        self.seen = [rows.to(self.algorithm.device) for rows in saved]
+        self._table = Table(self.path, COLUMNS, keep=probed["csv_rows"])
+
+    def _asked(self) -> dict[str, int]:
+        return {"every": self.every, "rows": self.probes.num_rows}
+
+    def _seed(self) -> int:
+        """A new one for each measurement, and nothing to remember."""
+        return int(np.random.SeedSequence([self.seed, self.algorithm.env_steps]).generate_state(1)[0] // 2)
+
+    def _learn(self) -> None:
+        """Let the other model learn what the algorithm's own has just learnt."""
+        algorithm, pop = self.algorithm, self.algorithm.buffers.pop
+        self.other.observe(pop[len(pop) - algorithm.env.episode_steps :])
+        for done in range(0, algorithm.model_updates, UPDATES_PER_SAMPLE):
+            count = min(UPDATES_PER_SAMPLE, algorithm.model_updates - done)
+            self.other.update(sample_mixture([(pop, algorithm.batch_size)], count, rng=self._rng))
+
+    def _measure(self, event: EpisodeDone) -> None:
+        """All that is measured after an episode."""
+        seed, policies = self._seed(), self.algorithm
+        del self.seen[event.index :]
+        self.seen.append(self.probes.trajectory(policies.individual.policy, event.design, seed=seed))
+        seen = joined(self.seen)
+        self._write(event, "seen", seen)
+        strangers = self.probes.unseen_trajectories(policies.population.policy, seed=seed)
+        self._write(event, "never built", strangers)
+        for name, generator in self.swaps.items():
+            rows, impossible = self.probes.swapped(seen, generator, seed=seed)
+            share = impossible.float().mean(0)
+            self._write(event, name, rows, impossible_share=share)
+            rows["next", "terminated"] |= impossible.unsqueeze(-1)
+            self._write(event, f"{name} possible", rows)
+
+    def _write(
+        self,
+        event: DesignChosen | EpisodeDone,
+        probe: str,
+        rows: TensorDictBase,
+        *,
+        impossible_share: torch.Tensor | None = None,
+    ) -> None:
+        """A row for each run that still learns and each model, the last of which says that nothing changes."""
+        variance = change_variance(self.learners["delta"])
+        valid = ~rows["next", "terminated"][..., 0]
+        errors = {predict: prediction_error(one.ensemble, rows) for predict, one in self.learners.items()}
+        errors["nothing"] = persistence_error(self.other.ensemble, rows)
+        episode = event.episode + 1 if isinstance(event, EpisodeDone) else 0
+        counts, at = valid.sum(0).tolist(), (event.index + 1, episode, self.algorithm.env_steps, probe)
+        shares = [None] * len(counts) if impossible_share is None else impossible_share.tolist()
+        self._table.append(
+            [run, *at, predict, *square, count, share]
+            for predict, error in errors.items()
+            for run, (square, count, share) in enumerate(
+                zip(zip(*(x.tolist() for x in mean_squares(error, variance, valid))), counts, shares)
+            )
+            if run not in event.diverged  # its own model is frozen, and the other one is not
+        )
+
+
+def other_learner(algorithm: CoAdaptation, **settings: Any) -> DynamicsLearner:
+    """A learner like the algorithm's own that predicts the other thing, with the same first weights.
+
+    Args:
+        algorithm: which has learnt nothing yet.
+        settings: of its `DynamicsLearner`.
+
+    Raises:
+        ValueError: if the algorithm learns no model.
+    """
+    if algorithm.dynamics is None:
+        raise ValueError("this run learns no model to measure; let an ensemble imagine, as with --designs known")
+    twin = deepcopy(algorithm.dynamics.ensemble)
+    twin.predict = "next" if twin.predict == "delta" else "delta"
+    return DynamicsLearner(twin, num_runs=twin.num_runs, **settings)

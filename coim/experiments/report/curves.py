@@ -1,0 +1,137 @@
+"""Curves over designs and over training: what the pictures of a run and of a comparison are made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from coim.experiments.drawing.palette import BLACK, GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
+from coim.experiments.run.records import Curves, Record, Row, curves
+
+STEPS = "training steps of one run"
+MANY_MARKS = 120
+MOST_EPISODES = 500  # points of a curve; of more, neighbours are averaged
+MANY_POINTS = 2000  # faint lines of more points than that are pixels, so that the page stays small
+
+
+def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = True, **style: str) -> None:
+    """Each run a faint line, their mean a strong one."""
+    if not found.x.size:
+        return
+    if faint and len(found.y) > 1:
+        faintness = {"linewidth": 0.6, "alpha": max(0.15, min(0.4, 1.5 / len(found.y))), "zorder": 1}
+        for run in found.y:
+            axes.plot(found.x, run, color=style["color"], rasterized=found.y.size > MANY_POINTS, **faintness)
+    marker = "o" if found.x.size == 1 else ""  # a line through one point would not be seen
+    axes.plot(found.x, found.mean, linewidth=1.4, zorder=3, label=label, marker=marker, **style)
+
+
+def episodes_in_a_point(record: Record) -> int:
+    """Episodes that a point of a curve over training steps is the mean of."""
+    return max(1, math.ceil(len({row["env_steps"] for row in record.episodes}) / MOST_EPISODES))
+
+
+def points_in_words(records: Sequence[Record]) -> str:
+    """A sentence on what a point is the mean of, where it is one of several episodes."""
+    most = max(episodes_in_a_point(record) for record in records)
+    return f" A point is the mean of {'up to ' if len(records) > 1 else ''}{most} episodes." if most > 1 else ""
+
+
+def plot_over_steps(
+    axes: Axes, records: Sequence[Record], column: str, *, prefix: str = "", faint: bool = True, **style: str
+) -> bool:
+    """One column of the episodes of each folder over training steps; says whether there was a number at all."""
+    drawn = False
+    for index, record in enumerate(records):
+        found = curves(record.episodes, "env_steps", column).averaged(episodes_in_a_point(record))
+        plot_curves(
+            axes, found, label=prefix or literal(record.name), faint=faint, **(style_of(index, len(records)) | style)
+        )
+        drawn |= bool(found.x.size)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    return drawn
+
+
+def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> None:
+    """One column of the designs of each folder: faint lines of runs, a mean, a mark at each design for its kind.
+
+    A hollow mark is a design that still has episodes to come.
+    """
+    for index, record in enumerate(records):
+        style = style_of(index, len(records))
+        found = curves(record.designs, "design", column)
+        line = style | ({"color": GREY} if len(records) == 1 and len(found.y) == 1 else {})
+        plot_curves(axes, found, label=literal(record.name), **line)
+        means = dict(zip(found.x.tolist(), found.mean.tolist()))
+        finished = {row["design"] for row in record.designs if row["finished"]}
+        rows = {
+            row["design"]: row | {column: means.get(row["design"], math.nan), "finished": row["design"] in finished}
+            for row in record.designs
+        }
+        mark_kinds(axes, list(rows.values()), column, style["color"] if len(records) > 1 else None)
+        mark_divergences(axes, [row for row in record.designs if row["diverged"]], "design", column)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+
+
+def mark_kinds(axes: Axes, rows: Sequence[Row], column: str, colour: str | None = None, x: str = "design") -> None:
+    """A mark at each design by its kind; ``colour`` overrules the kind's own."""
+    for kind, (own, marker) in KINDS.items():
+        for finished in (True, False):
+            points = [(row[x], row[column]) for row in rows if (row["kind"], row["finished"]) == (kind, finished)]
+            if points:
+                paint = colour or own
+                fill = paint if finished else "white"
+                size = 22 if len(rows) <= MANY_MARKS else 9
+                axes.scatter(*zip(*points), s=size, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
+
+
+def _under_way(record: Record) -> bool:
+    """Whether there is a design that no run has finished."""
+    finished = {row["design"] for row in record.designs if row["finished"]}
+    return any(row["design"] not in finished for row in record.designs)
+
+
+def mark_divergences(axes: Axes, rows: Sequence[Row], x: str, y: str) -> None:
+    """A cross where a run diverged."""
+    axes.scatter([row[x] for row in rows], [row[y] for row in rows], s=45, color=BLACK, marker="x", zorder=5)
+
+
+def cross_handles(records: Sequence[Record]) -> list[Line2D]:
+    """Entry of a legend for the crosses, if there are any."""
+    there = any(record.diverged for record in records)
+    return [Line2D([], [], color=BLACK, marker="x", linestyle="", label="run diverged")] if there else []
+
+
+def explain(
+    figure: Figure,
+    records: Sequence[Record],
+    *,
+    kinds: bool = False,
+    mean: bool = True,
+    more: Sequence[Line2D] = (),
+) -> None:
+    """A legend above the figure: folders where there are several, kinds of design where they are marked, the mean."""
+    several = len(records) > 1
+    handles = [
+        Line2D([], [], label=literal(r.name), **style_of(i, len(records))) for i, r in enumerate(records) if several
+    ]
+    if kinds:
+        there = [row["kind"] for record in records for row in record.designs]
+        handles += kind_handles(there, GREY if several else None)
+        if any(_under_way(record) for record in records):
+            hollow = {"markerfacecolor": "white", "markeredgecolor": GREY}
+            handles.append(Line2D([], [], marker="o", linestyle="", label="not finished", **hollow))
+    if mean and not several and records[0].num_runs > 1:
+        handles.append(Line2D([], [], label=f"mean of {records[0].num_runs} runs", **style_of(0, 1)))
+    put_legend(figure, [*handles, *more])
+
+
+def mark_builds(axes: Axes, record: Record) -> None:
+    """A light line wherever the next body was built."""
+    first = {row["design"]: row["env_steps"] for row in reversed(record.episodes)}
+    for steps in list(dict(sorted(first.items())).values())[1:]:
+        axes.axvline(steps, color=LIGHT, linewidth=0.6, zorder=0)

@@ -1,0 +1,167 @@
+"""Pictures of the designs of a run, or of several that are compared: one function each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from coim.envs import MorphEnv
+from coim.experiments.drawing.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
+from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.palette import GREY, literal, style_of
+from coim.experiments.report.curves import cross_handles, explain, mark_kinds, plot_over_designs
+from coim.experiments.run.records import Record, Row, number
+
+MOST_BODIES = 64  # of one run; of more the best are drawn
+BODIES_COMPARED = 5
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the page.
+
+    Attributes:
+        title: of its section.
+        caption: what is seen, in a sentence or two.
+        alt: the same in numbers, for who cannot see it.
+        figure: None where there is nothing to draw; the caption then says why.
+    """
+
+    title: str
+    caption: str
+    alt: str = ""
+    figure: Figure | None = field(default=None)
+
+
+def best_returns(records: Sequence[Record]) -> Picture:
+    """Best return of each design, in the order in which they were built."""
+    figure, (axes,) = new_figure(3.4)
+    plot_over_designs(axes, records, "best_return")
+    axes.set(xlabel="design (number)", ylabel="best return of a design (1)")
+    explain(figure, records, kinds=True, more=cross_handles(records))
+    tops = [
+        f"{r.name}: highest {number(_top(r)['best_return'])} at design {_top(r)['design']}" for r in records if r.best
+    ]
+    caption = "Highest return of the deterministic policy on each body, in the order in which they were built."
+    return Picture("Best return of each design", caption, "Best return over designs. " + "; ".join(tops), figure)
+
+
+def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
+    """Each design dimension over the order of building."""
+    names = records[0].design_names
+    size = len(names)
+    figure, grid = new_figure(0.6 + 1.7 * math.ceil(size / 2), math.ceil(size / 2), 2, sharex=True)
+    for i, (name, axes) in enumerate(zip(names, grid)):
+        spread = [replace(r, designs=[row | {"entry": row["xi"][i]} for row in r.designs]) for r in records]
+        plot_over_designs(axes, spread, "entry")
+        axes.set_title(name, loc="left", fontsize=10)
+        axes.set(ylabel="scale factor (1)")
+        if body is not None:
+            low, high = body.DESIGN_BOUNDS
+            margin = 0.06 * (high - low)
+            axes.set(ylim=(low - margin, high + margin))
+            for bound in (low, high):
+                axes.axhline(bound, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
+    for axes in grid[size:]:
+        axes.remove()
+    for axes in grid[max(0, size - 2) : size]:
+        axes.set(xlabel="design (number)")
+        axes.tick_params(labelbottom=True)
+    explain(figure, records, kinds=True, more=cross_handles(records))
+    bounds = (
+        "" if body is None else f" Dashed: the bounds, {body.DESIGN_BOUNDS[0]:.3g} and {body.DESIGN_BOUNDS[1]:.3g}."
+    )
+    caption = f"Scale factors of the body, 1 as drawn.{bounds}"
+    return Picture("Designs over time", caption, f"Scale factors over designs: {', '.join(names)}.{bounds}", figure)
+
+
+def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
+    """The bodies of one run, or the best of each folder."""
+    title = "Bodies"
+    if body is None:
+        return Picture(title, f"{records[0].environment} is no environment of coim: its bodies are not drawn.")
+    shown: list[tuple[str, list[Row]]] = []
+    for record in records:
+        if record.best:
+            run = _top(record)["run"]
+            rows = sorted((row for row in record.designs if row["run"] == run and _known(row)), key=_best_return)
+            best = rows[-(MOST_BODIES if len(records) == 1 else BODIES_COMPARED) :]
+            shown.append((f"{literal(record.name)}, run {run}", sorted(best, key=lambda row: row["design"])))
+    if not shown:
+        return Picture(title, "No design has a return yet.")
+    caption = (
+        "Bodies at rest, to one scale, in the order in which they were built; below each its number and best return."
+    )
+    if len(records) > 1:
+        caption += f" The best {BODIES_COMPARED} of the best run of each folder."
+    else:
+        rows = shown[0][1]
+        shown = [("", rows[i : i + BODIES_IN_A_LINE]) for i in range(0, len(rows), BODIES_IN_A_LINE)]
+        caption += f" The best {MOST_BODIES}" if len(rows) == MOST_BODIES else " All"
+        caption += (
+            f" of run {rows[0]['run']}, which has the best of all." if records[0].num_runs > 1 else " of the run."
+        )
+    numbers = ", ".join(f"design {row['design']}: {number(row['best_return'])}" for _, rows in shown for row in rows)
+    return Picture(title, caption, f"Bodies with their best returns. {numbers}", draw_lines_of_bodies(shown, body))
+
+
+def predictions(records: Sequence[Record]) -> Picture:
+    """Eq. 5 before a body was built against the best return on it."""
+    title = "Predicted and achieved"
+    figure, (axes,) = new_figure(3.6)
+    found = []
+    for index, record in enumerate(records):
+        rows = [row for row in record.designs if row["finished"] and _known(row) and math.isfinite(row["predicted"])]
+        colour = style_of(index, len(records))["color"] if len(records) > 1 else None
+        mark_kinds(axes, rows, "best_return", colour, x="predicted")
+        found.append((f"{record.name}: " if colour else "") + describe_correlation(rows))
+    if not axes.collections:
+        return Picture(title, "No design has both a prediction and a return yet: the first is built without one.")
+    axes.set(xlabel=r"predicted value $Q(\xi)$ before the body was built, discounted (1)", ylabel="best return (1)")
+    explain(figure, records, kinds=True, mean=False)
+    caption = (
+        "Eq. 5 before anything was learnt on a body, against the best return on it. The scales differ (discounted "
+    )
+    caption += "value of the population, return of an episode); the order counts. " + "; ".join(found) + "."
+    return Picture(title, caption, "Predicted value against best return. " + "; ".join(found), figure)
+
+
+def describe_correlation(rows: Sequence[Row]) -> str:
+    """Spearman's rank correlation of prediction and best return in words: of one run, or the mean over runs."""
+    by_run = [[row for row in rows if row["run"] == run] for run in sorted({row["run"] for row in rows})]
+    known = [(rank_correlation(own), len(own)) for own in by_run]
+    values = [value for value, _ in known if value is not None]
+    if not values:
+        return f"rank correlation not defined (n = {len(rows)} designs)"
+    counts = "/".join(str(n) for n in sorted({n for _, n in known}))
+    if len(values) == 1:
+        return f"Spearman's rank correlation {values[0]:.2f} (n = {counts} designs)"
+    spread = f"from {min(values):.2f} to {max(values):.2f}"
+    return (
+        f"Spearman's rank correlation {np.mean(values):.2f}, mean of {len(values)} runs, {spread} (n = {counts} each)"
+    )
+
+
+def rank_correlation(rows: Sequence[Row]) -> float | None:
+    """Spearman's of one run; None for less than three designs, or where all predictions or all returns are equal."""
+    predicted, achieved = ([row[name] for row in rows] for name in ("predicted", "best_return"))
+    if len(rows) < 3 or len(set(predicted)) == 1 or len(set(achieved)) == 1:
+        return None
+    return float(spearmanr(predicted, achieved).statistic)
+
+
+def _top(record: Record) -> Row:
+    return max(record.best.values(), key=_best_return)
+
+
+def _known(row: Row) -> bool:
+    return math.isfinite(row["best_return"])
+
+
+def _best_return(row: Row) -> float:
+    return row["best_return"]

@@ -1,0 +1,166 @@
+"""Pictures of the learning of a run, or of several that are compared: one function each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.palette import BLACK, BLUE, GREY, SKY, style_of
+from coim.experiments.report.curves import (
+    STEPS,
+    cross_handles,
+    episodes_in_a_point,
+    explain,
+    mark_builds,
+    mark_divergences,
+    plot_curves,
+    plot_over_steps,
+    points_in_words,
+)
+from coim.experiments.report.designs import Picture
+from coim.experiments.run.records import Record, curves, number
+
+LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
+    "loss_actor": "actor loss (1)",
+    "loss_qvalue": "critic loss (1, squared)",
+    "alpha_entropy": r"$\alpha\,\times$ entropy (nats)",
+    "loss_dynamics": "model loss, Eq. 6 (1)",
+}
+
+
+def learning_curves(records: Sequence[Record]) -> Picture:
+    """Return over training steps."""
+    figure, (axes,) = new_figure(3.4)
+    caption = "Return of the deterministic policy after each training episode."
+    if len(records) == 1:
+        mark_builds(axes, records[0])
+        sampled = curves(records[0].episodes, "env_steps", "training_return").averaged(episodes_in_a_point(records[0]))
+        plot_curves(axes, sampled, faint=False, color=SKY, linestyle="-", label="training episode, sampled actions")
+        plot_over_steps(axes, records, "return", prefix="evaluation episode, deterministic actions")
+        handles, _ = axes.get_legend_handles_labels()
+        explain(figure, records, mean=False, more=[*handles, *cross_handles(records)])
+        caption += " Upright lines: the next body. Faint lines: single runs, where there are several."
+    else:
+        plot_over_steps(axes, records, "return")
+        explain(figure, records, more=cross_handles(records))
+    for record in records:
+        mark_divergences(axes, [*record.diverged.values()], "env_steps", "return")
+    axes.set(xlabel=f"{STEPS} (1)", ylabel="return of an episode (1)")
+    last = [f"{r.name}: {curves(r.episodes, 'env_steps', 'return').mean[-1:].round(2).tolist()}" for r in records]
+    caption += points_in_words(records)
+    return Picture("Learning curves", caption, "Return over training steps. Last mean: " + "; ".join(last), figure)
+
+
+def model_errors(records: Sequence[Record]) -> Picture:
+    """How well the ensemble foresaw each new episode."""
+    title = "Model error over time"
+    figure, (axes,) = new_figure(3.0)
+    if len(records) == 1:
+        mark_builds(axes, records[0])
+    if not plot_over_steps(axes, records, "model_error"):
+        return Picture(title, "No model was learnt.")
+    axes.set(xlabel=f"{STEPS} (1)", ylabel="squared error over\nvariance of changes (1)", yscale="log")
+    low, high = axes.get_ylim()
+    axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=LogLocator(subs=(3, 4, 6, 7, 8, 9)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}" if high < 5 * low else NullFormatter())
+    axes.axhline(1, color=GREY, linestyle="--", linewidth=0.8)
+    explain(figure, records)
+    caption = (
+        "Squared error of the model's means on each new episode before learning from it, in units of the variance of "
+    )
+    caption += "one-step changes. Dashed: as good as predicting that nothing changes." + points_in_words(records)
+    ends = [f"{r.name}: {m[0]:.3g} to {m[-1]:.3g}" for r in records if (m := _means(r, "model_error")).size]
+    return Picture(title, caption, "Model error over training steps. " + "; ".join(ends), figure)
+
+
+def losses(records: Sequence[Record]) -> Picture:
+    """Losses of both learners and of the model, and the entropy term."""
+    title = "Losses and entropy"
+    weighted = [_with_weighted_entropy(record) for record in records]
+    figure, grid = new_figure(4.6, 2, 2)
+    drawn = False
+    alone = len(records) == 1  # faint lines of many runs of several folders would hide everything
+    learners = {
+        "individual": {"linestyle": "-"},
+        "population": {"linestyle": "--"} | ({"color": BLUE} if alone else {}),
+    }
+    for axes, (name, label) in zip(grid, LOSSES.items()):
+        there = False
+        for who, style in ({"model": {"linestyle": "-"}} if name == "loss_dynamics" else learners).items():
+            there |= plot_over_steps(axes, weighted, f"{who}/{name}", faint=alone, **style)
+        axes.set(xlabel=f"{STEPS} (1)", ylabel=label)
+        axes.locator_params(axis="x", nbins=4)
+        axes.set_visible(there)
+        drawn |= there
+    if not drawn:
+        return Picture(title, "The folder has no metrics.csv, or it has no rows: losses are not known.")
+    grey = {"color": BLACK if alone else GREY}
+    lines = [Line2D([], [], label=f"{who} learner", **grey | style) for who, style in learners.items()]
+    explain(figure, records, mean=False, more=lines)
+    caption = (
+        "Means over the updates after each episode, of the learners' losses and of the model's."
+        + points_in_words(records)
+    )
+    caption += " Faint lines: single runs." if alone and records[0].num_runs > 1 else ""
+    return Picture(
+        title, caption, "Actor loss, critic loss, weighted entropy and model loss over training steps.", figure
+    )
+
+
+def times(records: Sequence[Record]) -> Picture:
+    """Where the wall-clock went."""
+    title = "Time spent"
+    spent = [time_by_part(record) for record in records]
+    parts = sorted({part for found in spent for part in found}, key=lambda part: -max(f.get(part, 0.0) for f in spent))
+    if not parts:
+        return Picture(title, "The folder has no metrics.csv, or it has no rows: times are not known.")
+    figure, (axes,) = new_figure(0.9 + 0.22 * len(parts) * (1 + len(records)))
+    height = 0.8 / len(records)
+    for index, found in enumerate(spent):
+        places = np.arange(len(parts)) + (index + 0.5) * height - 0.4
+        minutes = [found.get(part, 0.0) / 60 for part in parts]
+        bars = axes.barh(
+            places, minutes, height, color=BLUE if len(records) == 1 else style_of(index, len(records))["color"]
+        )
+        axes.bar_label(bars, [f"{value:.2g}" if value < 1 else number(value, 3) for value in minutes], padding=3)
+    axes.set_yticks(range(len(parts)), parts)
+    axes.invert_yaxis()
+    axes.set(xlabel="wall-clock (min)")
+    axes.margins(x=0.12)
+    if len(records) > 1:
+        explain(figure, records)
+    caption = "Wall-clock by part, all runs of a folder together. Learners that train side by side overlap; "
+    caption += "'between episodes' holds the design search."
+    told = [f"{r.name}: " + ", ".join(f"{p} {s / 60:.3g} min" for p, s in f.items()) for r, f in zip(records, spent)]
+    return Picture(title, caption, "Wall-clock by part. " + "; ".join(told), figure)
+
+
+def time_by_part(record: Record) -> dict[str, float]:
+    """Seconds of each part over all episodes so far, and what lies between the episodes."""
+    rows = [*{(row["design"], row["episode"]): row for row in record.episodes}.values()]  # the same for all runs
+    names = [name for name in rows[0] if name.startswith("seconds/")]
+    totals = {name.removeprefix("seconds/"): sum(row.get(name, 0.0) for row in rows) for name in names}
+    if totals:
+        totals["between episodes"] = max(0.0, rows[-1]["seconds"] - totals.pop("episode", 0.0))
+    return totals
+
+
+def _with_weighted_entropy(record: Record) -> Record:
+    alpha = record.settings.get("alpha", math.nan)
+    rows = [
+        row
+        | {f"{who}/alpha_entropy": alpha * row.get(f"{who}/entropy", math.nan) for who in ("individual", "population")}
+        for row in record.episodes
+    ]
+    return replace(record, episodes=rows)
+
+
+def _means(record: Record, column: str) -> np.ndarray:
+    return curves(record.episodes, "env_steps", column).mean

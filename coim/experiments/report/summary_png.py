@@ -1,0 +1,52 @@
+"""The picture at the end of a run: best return of each design, and the bodies beside each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+from coim.envs import MorphEnv
+from coim.experiments.drawing.bodies import draw_bodies
+from coim.experiments.report.curves import cross_handles, explain, plot_over_designs
+from coim.experiments.run.atomic_write import written_aside
+from coim.experiments.run.records import read_record
+
+BODIES_SHOWN = 8
+
+
+def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
+    """Draw what the folder holds.
+
+    Args:
+        folder: of the run.
+        body: what the designs belong to.
+
+    Returns:
+        ``figures/designs.png`` in the folder.
+    """
+    record = read_record(folder, folder.name)
+    figure, (returns, bodies) = plt.subplots(2, 1, figsize=(9, 7), height_ratios=[3, 2], layout="constrained")
+    plot_over_designs(returns, [record], "best_return")
+    returns.set(xlabel="design (number)", ylabel="best return of a design (1)")
+    returns.spines[["top", "right"]].set_visible(False)
+    explain(figure, [record], kinds=True, more=cross_handles([record]))
+    # The best run's, as on the page: the first run may have diverged before it had many.
+    run = max(record.best.values() or record.designs, key=lambda row: row["best_return"])["run"]
+    own = [row for row in record.designs if row["run"] == run]
+    best = sorted(own, key=lambda row: row["best_return"])[-BODIES_SHOWN:]
+    draw_bodies(bodies, sorted(best, key=lambda row: row["design"]), body)
+    whose = f" of run {run}" if record.num_runs > 1 else ""
+    bodies.set_title(f"bodies{whose} at rest: number of the design, best return")
+    path = folder / "figures" / "designs.png"
+    save(figure, path)
+    return path
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure and free it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(path) as aside:
+        figure.savefig(aside, dpi=150)
+    plt.close(figure)

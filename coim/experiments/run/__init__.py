@@ -1,0 +1,1 @@
+"""One run: settings, folder, checkpoints, resuming, progress."""

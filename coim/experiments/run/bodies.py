@@ -1,0 +1,39 @@
+"""A body that is none of the three, by the name of its class on a command line."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from coim.envs import MorphEnv
+
+
+def imported_body(name: str | None) -> type[MorphEnv] | None:
+    """The class that a command line names.
+
+    Args:
+        name: ``module:Class``; the module is looked for as Python does, the present folder included. None is none.
+
+    Raises:
+        ValueError: if there is no such module or class, or it is no `MorphEnv`.
+
+    Example:
+        >>> imported_body("coim.envs.hopper:HopperMorph").__name__
+        'HopperMorph'
+        >>> imported_body("coim.envs.hopper")
+        Traceback (most recent call last):
+        ValueError: --body is 'coim.envs.hopper', it must be module:Class, such as coim.envs.hopper:HopperMorph
+    """
+    if name is None:
+        return None
+    module, _, called = name.partition(":")
+    if not module or not called:
+        raise ValueError(f"--body is {name!r}, it must be module:Class, such as coim.envs.hopper:HopperMorph")
+    try:
+        body = getattr(import_module(module), called)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"--body {name} cannot be found ({error}); start from the folder in which {module} lies"
+        ) from None
+    if not (isinstance(body, type) and issubclass(body, MorphEnv)):
+        raise ValueError(f"--body {name} is no body: name a class that is derived from coim.MorphEnv")
+    return body

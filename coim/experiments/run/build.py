@@ -1,0 +1,175 @@
+"""The parts of Algorithm 1, made from settings and put together."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from coim.batches import batch_parts
+from coim.buffers import Buffers
+from coim.coadaptation import CoAdaptation
+from coim.designs import (
+    DesignGenerator,
+    DesignSearch,
+    GradientSearch,
+    KnownDesigns,
+    NoisyDesigns,
+    ParticleSwarm,
+    RandomDesigns,
+)
+from coim.envs import MorphEnv, SimulatorDynamics, WorldModelEnv
+from coim.experiments.run.machine import checked_device
+from coim.experiments.run.settings import Settings
+from coim.learners.dynamics import DynamicsLearner
+from coim.learners.sac import SACLearner
+from coim.models import NetworkSizes
+
+SIMULATED_ROWS = 250  # bodies that the simulator sets up and steps at once where it takes the ensemble's place
+
+
+def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by_side: bool = False) -> CoAdaptation:
+    """Make the parts of Algorithm 1 and put them together."""
+    device = checked_device(settings.device)
+    # Streams of one seed that have nothing in common, nor with those of the next seed.
+    seeds = iter(np.random.SeedSequence(settings.seed).generate_state(8).tolist())
+    torch.manual_seed(next(seeds))  # initial weights
+    # Nothing of ours draws from these two. What somebody plugs in may, and shall repeat as well.
+    random.seed(settings.seed)
+    np.random.seed(settings.seed % 2**32)  # noqa: NPY002
+
+    def bodies() -> MorphEnv:
+        return body(
+            num_runs=settings.num_runs,
+            task=settings.task,
+            episode_steps=settings.episode_steps,
+            seed=next(seeds),
+            num_threads=threads,
+            device=device,
+        )
+
+    env, evaluation_env = bodies(), bodies()
+    sizes = NetworkSizes.among(vars(settings))
+    population, individual = (make_learner(env, sizes, settings, seed=next(seeds)) for _ in range(2))
+    generator = make_generator(env, settings)
+    dynamics, dream = None, None
+    if generator is not None:
+        dynamics, dream = make_dream(env, sizes, settings, threads=threads)
+    return CoAdaptation(
+        env,
+        evaluation_env,
+        population=population,
+        individual=individual,
+        buffers=make_buffers(env, settings, seed=next(seeds)),
+        search=make_search(env, settings, seed=next(seeds)),
+        first_designs=torch.tensor(first_designs(body, settings), dtype=torch.float32, device=device),
+        bodies=settings.bodies,
+        dynamics=dynamics,
+        dream=dream,
+        generator=generator,
+        num_designs=settings.num_designs,
+        first_episodes=settings.first_episodes,
+        episodes=settings.episodes,
+        individual_updates=settings.individual_updates,
+        population_updates=settings.population_updates,
+        model_updates=settings.model_updates,
+        batch_size=settings.batch_size,
+        imagined_share=settings.imagined_share,
+        individual_mix=settings.individual_mix,
+        individual_imagined_share=settings.individual_imagined_share,
+        num_start_states=settings.num_start_states,
+        side_by_side=side_by_side,
+        precision=settings.precision,
+        seed=next(seeds),
+    )
+
+
+def make_learner(env: MorphEnv, sizes: NetworkSizes, settings: Settings, *, seed: int) -> SACLearner:
+    """Policy and critics with their optimiser."""
+    return SACLearner(
+        sizes.policy(env).to(env.device),
+        sizes.qvalue(env).to(env.device),
+        alpha=settings.alpha,
+        gamma=settings.gamma,
+        tau=settings.tau,
+        lr=settings.lr,
+        mix=settings.mix,
+        num_runs=sizes.stacked,
+        precision=settings.precision,
+        compile=settings.compile,
+        seed=seed,
+    )
+
+
+def make_dream(
+    env: MorphEnv, sizes: NetworkSizes, settings: Settings, *, threads: int
+) -> tuple[DynamicsLearner | None, WorldModelEnv]:
+    """Where transitions are imagined, and the learner of p~ unless the simulator itself imagines."""
+    if settings.dream == "simulator":
+        # Its reset noise is never used: the seeds of all other parts stay what they are with an ensemble.
+        truth = SimulatorDynamics(type(env)(num_runs=SIMULATED_ROWS, seed=0, num_threads=threads, device=env.device))
+        return None, WorldModelEnv(truth, env, batch_size=env.batch_size)
+    ensemble = sizes.ensemble(env).to(env.device)
+    learner = DynamicsLearner(
+        ensemble,
+        lr=settings.model_lr,
+        weight_decay=settings.weight_decay,
+        num_runs=sizes.stacked,
+        precision=settings.precision,
+        compile=settings.compile,
+    )
+    return learner, WorldModelEnv(ensemble, env, batch_size=env.batch_size)
+
+
+def first_designs(body: type[MorphEnv], settings: Settings) -> Sequence[Sequence[float]]:
+    """Bodies that every run tries first: those of the environment, or the one that is asked for."""
+    return [settings.first_design] if settings.first_design else body.FIRST_DESIGNS
+
+
+def episodes_of_designs(body: type[MorphEnv], settings: Settings) -> list[int]:
+    """Training episodes of each design."""
+    num_first = min(len(first_designs(body, settings)), settings.num_designs)
+    return [settings.first_episodes] * num_first + [settings.episodes] * (settings.num_designs - num_first)
+
+
+def make_generator(env: MorphEnv, settings: Settings) -> DesignGenerator | None:
+    """G by its name on the command line."""
+    if settings.designs == "none":
+        return None
+    if settings.designs == "noisy":
+        return NoisyDesigns(env.design_spec, sigma=settings.sigma)
+    return KnownDesigns() if settings.designs == "known" else RandomDesigns(env.design_spec)
+
+
+def make_search(env: MorphEnv, settings: Settings, *, seed: int) -> DesignSearch:
+    """What maximises Eq. 5, by its name on the command line."""
+    if settings.search == "gradient":
+        return GradientSearch(env.design_spec, seed=seed)
+    return ParticleSwarm(
+        env.design_spec,
+        num_particles=settings.num_particles,
+        num_iterations=settings.num_iterations,
+        bounds=settings.swarm_bounds,
+        seed=seed,
+    )
+
+
+def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
+    """Four buffers that can hold everything this run will ever put into them."""
+    episodes = episodes_of_designs(type(env), settings)
+    population = batch_parts(settings.batch_size, imagined=settings.imagined_share)
+    individual = batch_parts(
+        settings.batch_size, imagined=settings.individual_imagined_share, other=settings.individual_mix
+    )
+    imagined = settings.population_updates * population.imagined + settings.individual_updates * individual.imagined
+    return Buffers.for_env(
+        env,
+        pop_capacity=sum(episodes) * settings.episode_steps,
+        ind_capacity=max(episodes) * settings.episode_steps,
+        s0_capacity=sum(episodes),
+        art_capacity=max(1, imagined),
+        seed=seed,
+        device=checked_device("cpu" if settings.replay_device == "cpu" else settings.device),
+    )

@@ -1,0 +1,46 @@
+"""The command line of a run."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import tyro
+
+from coim.experiments.run.effect import refuse_without_effect
+from coim.experiments.run.resume import refuse_changes, saved_settings
+from coim.experiments.run.settings import PRESETS, Settings, check, given, option
+
+
+def parse(
+    program: str, description: str, arguments: Sequence[str] | None = None, *, read: Collection[str] = ()
+) -> Settings:
+    """Read the command line; ``--preset`` only moves the defaults of everything else.
+
+    Args:
+        program: shown in the usage line.
+        description: shown in the help.
+        arguments: instead of ``sys.argv[1:]``.
+        read: settings that the program reads for purposes of its own, whether or not they change the run.
+
+    Raises:
+        SystemExit: on an unknown option or value, or one that would change nothing, with a sentence on standard error.
+        ValueError: if the folder to resume holds no run, or a setting was changed that its past depends on.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default="paper")
+    first.add_argument("--resume", type=Path)
+    known = first.parse_known_args(arguments)[0]
+    default = PRESETS.get(known.preset, PRESETS["paper"])  # an unknown name is refused below, with those that exist
+    if known.resume is not None:
+        default = saved_settings(known.resume)
+    settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
+    try:
+        check(settings, called=option)
+        refuse_without_effect(settings, given(arguments), called=option, read=read)
+    except ValueError as error:
+        first.error(str(error))
+    if known.resume is not None:
+        refuse_changes(default, settings)
+    return settings

@@ -1,0 +1,49 @@
+"""Where a run comes from, as its ``config.json`` has it: settings, versions, machine, revision, time."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import secrets
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from coim.experiments.run.settings import Settings, plain
+from coim.products import chosen
+
+PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
+
+
+def versions() -> dict[str, str]:
+    """Of everything that decides about the numbers."""
+    return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+
+
+def describe(environment: str, settings: Settings) -> dict[str, Any]:
+    """Everything that somebody needs to repeat the run."""
+    return {
+        "environment": environment,
+        "settings": plain(settings),
+        "products": chosen()._asdict(),
+        "versions": versions(),
+        "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
+        "revision": git_revision(),
+        "started": now(),
+        "wandb_id": secrets.token_hex(4),  # one W&B run holds the whole curve, however often it is resumed
+    }
+
+
+def now() -> str:
+    """The time in UTC, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def git_revision() -> str | None:
+    """Commit of the checkout that this file lies in, with ``-dirty`` where it was changed; None outside of one."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -1,0 +1,1 @@
+"""Many runs that are compared: definition, arms, ledger, scheduling, archive."""

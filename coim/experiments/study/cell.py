@@ -1,0 +1,83 @@
+"""One cell of a study, in whatever process it is computed."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import traceback
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+from coim.envs import BODIES
+from coim.experiments.run.interrupt import ANY_NAME
+from coim.experiments.run.provenance import now
+from coim.experiments.run.resume import FREE, to_go_on
+from coim.experiments.run.settings import Settings, plain
+from coim.experiments.train import run
+from coim.run_folder import read_config
+from coim.tables import OF_RUN, read_cells
+
+STARTED = "started"  # how a line of a log begins with which a try began
+# A finished run is what it is wherever it was made and is called.
+OF_NO_NUMBER = FREE | {"out", "device", "replay_device", "name"}
+
+
+def compute(environment: str, settings: Settings, log: Path) -> None:
+    """Make the run of a cell, or go on with it from its last checkpoint.
+
+    Args:
+        environment: name of the body.
+        settings: of the run; ``out`` is its folder.
+        log: what it says, and how it ended if not well, is written there.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a", buffering=1, errors=ANY_NAME) as words, redirect_stdout(words), redirect_stderr(words):
+        print(f"{STARTED} {now()} on {platform.node()}, process {os.getpid()}")
+        try:
+            run(BODIES[environment], environment, to_go_on(settings))
+        except BaseException:
+            traceback.print_exc()
+            raise
+        print(f"finished {now()}")
+
+
+def still_finished(settings: Settings, folder: Path) -> bool:
+    """Whether a cell that was finished once is what the study asks for now.
+
+    Returns:
+        False if its folder is gone, or if it is to try more designs than it has tried.
+
+    Raises:
+        ValueError: if it was made with other settings: it would be compared with runs of another protocol.
+    """
+    if not (folder / "config.json").exists():
+        return False
+    saved, asked = read_config(folder)["settings"], json.loads(json.dumps(plain(settings)))
+    more = asked["num_designs"] > saved["num_designs"]
+    fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})
+    if other := [name for name in sorted(fixed) if saved[name] != asked[name]]:
+        told = ", ".join(f"{name} ({saved[name]!r} to {asked[name]!r})" for name in other)
+        raise ValueError(
+            f"the run in {folder} was made with other settings: {told}; leave them, or take another folder"
+        )
+    return not more
+
+
+def tries(log: Path) -> int:
+    """How often a cell was begun or gone on with."""
+    return sum(line.startswith(STARTED) for line in log.read_text().splitlines()) if log.exists() else 0
+
+
+def episodes_done(folder: Path, num_runs: int) -> int:
+    """Episodes of a cell that are in its table."""
+    try:
+        return max(0, (folder / "evaluations.csv").read_bytes().count(b"\n") - 1) // num_runs
+    except OSError:
+        return 0
+
+
+def seconds_of(folder: Path) -> float:
+    """What a run took, by its own clock: of all the processes that computed at it; 0 if its table is not there."""
+    path = folder / "evaluations.csv"  # a shared file system may show it later
+    return max((float(row["seconds"] or 0.0) for row in read_cells(path, OF_RUN[path.name])), default=0.0)

@@ -1,0 +1,1 @@
+"""What trains the networks: soft actor-critic and the dynamics ensemble, each over K runs at once."""

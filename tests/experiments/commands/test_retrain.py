@@ -1,0 +1,204 @@
+"""Fig. 2's retraining: which designs, that it is plain SAC from scratch, and that it goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import pytest
+
+from coim import HopperMorph
+from coim.experiments import train as experiment
+from coim.experiments.commands.retrain import episodes_in_words, main
+from coim.experiments.figures.write import write_figures
+from coim.experiments.run.command_line import parse
+from coim.experiments.run.settings import Settings, plain
+from coim.experiments.study.retraining import Retrain, best_designs, cell_of, choose
+from coim.experiments.study.runs import read_runs
+from coim.tables import design_columns
+from tests.experiments.made_up_study import read_table, write_cell
+from tests.experiments.test_train import TINY, tiny
+
+XI = design_columns(HopperMorph.design_names())
+PLACE = ("hopper", "forward")
+
+
+KINDS = ("first", "optimised", "random", "optimised", "optimised")
+RULE = {"top": 0.5, "most": 18}
+
+
+def found(study: Path, cell: str, *runs: tuple[float, float, float]) -> None:
+    """A cell with three designs in each run that Eq. 5 chose, between better ones that it did not."""
+    returns = ([90, one, 80, other, third] for one, other, third in runs)
+    write_cell(study, cell, *returns, kinds=KINDS, num_designs=5)
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Three runs of "known" and two, of one cell, of "none"."""
+    found(tmp_path, "hopper-forward-known-0", (31, 27, 33))
+    found(tmp_path, "hopper-forward-known-1", (5, 7, 6))
+    found(tmp_path, "hopper-forward-known-2", (20, 28, 10))
+    found(tmp_path, "hopper-forward-none-0", (1, 2, 3), (6, 5, 4))
+    return tmp_path
+
+
+def test_the_best_half_is_of_the_designs_that_eq_5_chose_in_each_run(study: Path) -> None:
+    runs = read_runs(study)
+    lines = list(best_designs(runs, PLACE, ["known"], RULE))
+    # Half of three, rounded up, of each run: not the best five of all together, of which 6 and 7 would not be.
+    assert [line["found_return"] for line in lines] == ["33", "31", "28", "20", "7", "6"]
+    assert lines[0]["folder"] == "hopper-forward-known-0-run0-design5"
+    assert lines[0]["xi"] == "1.5 1"
+    assert {(line["found"], line["kept"], line["top"], line["most"]) for line in lines} == {("9", "6", "0.5", "18")}
+    of_none = list(best_designs(runs, PLACE, ["none"], RULE))
+    assert [(line["run"], line["found_return"]) for line in of_none] == [("1", "6"), ("1", "5"), ("0", "3"), ("0", "2")]
+    assert len(list(best_designs(runs, PLACE, ["none"], {"top": 1.0, "most": 18}))) == 6
+
+
+def test_the_cap_is_divided_among_the_runs_alike_in_all_arms_and_at_least_one_each(study: Path) -> None:
+    runs = read_runs(study)
+    for most, of_none, of_known in ((3, 2, 3), (5, 4, 5), (6, 4, 6), (2, 2, 3)):  # of two runs and of three
+        rule = {"top": 1.0, "most": most}
+        together = list(best_designs(runs, PLACE, ["none", "known"], rule))
+        assert [line["arm"] for line in together] == ["none"] * of_none + ["known"] * of_known
+        assert list(best_designs(runs, PLACE, ["known"], rule)) == together[-of_known:]  # whoever is chosen with it
+
+
+def test_a_share_of_whole_designs_is_not_rounded_up(tmp_path: Path) -> None:
+    count = 25
+    write_cell(
+        tmp_path, "hopper-forward-known-0", range(count), kinds=["optimised"] * count, predicted=range(count),
+        num_designs=count,
+    )  # fmt: skip
+    assert 7 / 25 * 25 > 7  # rounded up, it would be eight
+    assert len(list(best_designs(read_runs(tmp_path), PLACE, ["known"], {"top": 7 / 25, "most": 18}))) == 7
+
+
+def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study: Path) -> None:
+    path = study / "chosen.csv"
+    first = choose(read_runs(study), path, Retrain(study=study, arms=("known",)))
+    found(study, "hopper-forward-known-7", (99, 98, 97))
+    both = choose(read_runs(study), path, Retrain(study=study))
+    assert both[:6] == first
+    assert [line["arm"] for line in both[6:]] == ["none"] * 4
+    assert read_table(path) == both
+
+
+def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Path) -> None:
+    path, runs = study / "chosen.csv", read_runs(study)
+    choose(runs, path, Retrain(study=study, arms=("known",), top=0.7, most=3))
+    before = path.read_bytes()
+    for name, value, words in (
+        (
+            "top",
+            0.5,
+            "--top is 0.5, but the designs in .*retrained were chosen by 0.7; leave the option out, or delete",
+        ),
+        ("most", 4, "--most is 4, but the designs in .*retrained were chosen by 3; leave"),
+    ):
+        for arms in (("known",), ("none",)):
+            with pytest.raises(ValueError, match=words):
+                choose(runs, path, Retrain(study=study, arms=arms, **{name: value}))
+    assert path.read_bytes() == before
+    lines = choose(runs, path, Retrain(study=study, top=0.7))  # the same, and one that is left out
+    assert [(line["arm"], line["found"], line["kept"]) for line in lines] == [
+        *[("known", "9", "3")] * 3,
+        *[("none", "6", "2")] * 2,
+    ]
+    assert {(line["top"], line["most"]) for line in lines} == {("0.7", "3")}
+
+
+def settings_of(study: Path, cell: str, **values: object) -> Settings:
+    """Give a made-up cell every setting of a run."""
+    settings = parse("test", "", tiny("--designs", "random", "--individual-imagined-share", "0.5", "--lr", "0.001"))
+    config = {"environment": "hopper", "settings": plain(settings) | values}
+    (study / "cells" / cell / "config.json").write_text(json.dumps(config))
+    return settings
+
+
+def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_one_body(study: Path) -> None:
+    cell = "hopper-forward-known-0"
+    settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
+    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
+    own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
+    assert (own.designs, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
+    assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
+    assert (own.first_design, own.first_episodes) == ((0.75, 1), 9)
+    assert (own.lr, own.batch_size, own.individual_updates) == (0.001, settings.batch_size, settings.individual_updates)
+    settings_of(study, "hopper-forward-known-2")
+    other = cell_of(lines[1], Retrain(study=study)).settings
+    assert own.seed != other.seed
+    assert other.first_episodes == settings.first_episodes
+
+
+@pytest.mark.usefixtures("cluster")
+def test_designs_are_retrained_once_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "coim.experiments.commands.retrain.ray_running", lambda *_, **__: contextlib.nullcontext()
+    )  # on the cluster there is
+    for arm in ("none", "known"):
+        folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
+        experiment.main(HopperMorph, "hopper", tiny("--designs", arm, "--quiet", "--out", str(folder)))
+    with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
+        main([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
+    capsys.readouterr()
+    main([str(tmp_path), "--episodes", "2", "--workers", "1"])
+    said = capsys.readouterr().out
+    assert "2 of 2 designs to train" in said
+    assert "\n2 training episodes on each\n" in said
+    chosen = read_table(tmp_path / "retrained" / "designs.csv")
+    for line in chosen:
+        cell = tmp_path / "cells" / line["cell"]
+        found = next(row for row in read_table(cell / "designs.csv") if row["kind"] == "optimised")
+        episodes = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert [row["kind"] for row in episodes] == ["first", "first"]
+        assert [row["episode"] for row in episodes] == ["1", "2"]
+        assert all(row[name] == found[name] for row in episodes for name in XI)
+    main([str(tmp_path), "--episodes", "2", "--workers", "1"])
+    assert "0 of 2 designs to train" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"made with other settings: first_episodes \(2 to 3\)"):
+        main([str(tmp_path), "--episodes", "3"])
+    write_figures(tmp_path)
+    rows = read_table(tmp_path / "figures" / "figure_2_retrained.csv")
+    for row, line in zip(rows, chosen, strict=True):
+        own = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
+        assert (row["episodes"], row["study_episodes"]) == ("2", TINY[TINY.index("--episodes") + 1])
+
+
+def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None:
+    for seed in (2, 0):
+        settings_of(study, f"hopper-forward-known-{seed}", first_episodes=300 + seed)
+    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
+    assert episodes_in_words([cell_of(line, Retrain(study=study)) for line in lines]) == "300 or 302"
+    assert episodes_in_words([cell_of(line, Retrain(study=study, episodes=9)) for line in lines]) == "9"
+
+
+def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:
+    for options, words in (
+        (["--top", "0"], "--top is 0"),
+        (["--most", "0"], "--most is 0"),
+        (["--episodes", "0"], "--episodes is 0"),
+        (["--workers", "2", "--ray-address", "auto"], "a cluster decides itself"),
+        (["--arms", "oracle"], "'oracle' is no arm of .*--arms none known"),
+    ):
+        with pytest.raises(SystemExit, match=words):
+            main([str(study), *options])
+    with pytest.raises(SystemExit, match="has no cells/"):
+        main([str(tmp_path / "nowhere")])
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_an_arm_that_chose_no_body_has_nothing_to_retrain(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_cell(tmp_path, "hopper-forward-none-0", [90, 20])
+    with pytest.raises(SystemExit, match="no run of none has an optimised design yet"):
+        main([str(tmp_path), "--arms", "none"])
+    found(tmp_path, "hopper-forward-known-0", (31, 27, 33))
+    choose(read_runs(tmp_path), tmp_path / "chosen.csv", Retrain(study=tmp_path))
+    assert capsys.readouterr().out == (
+        "hopper, forward: no run of none has an optimised design, there is nothing to retrain of it\n"
+    )

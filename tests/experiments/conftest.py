@@ -1,0 +1,26 @@
+"""What several tests of recipes share."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator:
+    """A Ray of this machine: a head without cores, as on clusters whose head has other work, and one node with two.
+
+    One for all tests: it takes as long to begin as what is computed on it.
+    """
+    ray_cluster = pytest.importorskip("ray.cluster_utils")
+    from coim.experiments.study.cluster import ray_running
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("RAY_worker_niceness", "0")  # or a machine with other work lets the tests wait
+        nodes = ray_cluster.Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        nodes.add_node(num_cpus=2)
+    with ray_running(io.StringIO(), address=nodes.address):
+        yield nodes
+    nodes.shutdown()
