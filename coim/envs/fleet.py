@@ -105,10 +105,12 @@ class Fleet:
         Args:
             observation: ``[*B, S]``.
             design: ``[*B, D]``, the body that the state was seen with.
-            new_design: ``[*B, D]``.
+            new_design: ``[*B, D]``. The batches of the three are broadcast: ``[n, S], [n, D], [P, 1, D]`` puts each of
+                n states under each of P bodies.
 
         Returns:
-            ``[*B, S]``; the transfer back gives the observation again. Differentiable in all three.
+            ``[*B, S]``; the transfer back gives the observation again, and the same design leaves it as it is, to the
+            last bit. Differentiable in all three.
 
         Example:
             >>> from coim import HopperMorph
@@ -120,6 +122,7 @@ class Fleet:
         """
         rise = self.clearance(observation, design) - self.clearance(observation, new_design)
         height = self._kinematics.height - self._first_position
+        observation = observation.expand(*rise.shape[:-1], -1)
         before, after = observation[..., :height], observation[..., height + 1 :]
         return torch.cat([before, observation[..., height, None] + rise, after], -1)
 

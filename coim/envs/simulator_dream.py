@@ -72,6 +72,12 @@ class SimulatorDynamics:
             after[part] = found[: len(after[part])]
         return after.reshape(observation.shape)
 
+    def means(
+        self, *asked: tuple[Tensor, Tensor, Tensor], generator: torch.Generator | None = None
+    ) -> tuple[Tensor, ...]:
+        """Step several sets of (observation, action, design), as :meth:`sample` does: the physics have no spread."""
+        return tuple(self.sample(*one) for one in asked)
+
 
 def _filled_up(rows: Tensor, count: int) -> Tensor:
     """The last row repeated until there are as many as the fleet has."""

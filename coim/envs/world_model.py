@@ -11,8 +11,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol, Self
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,6 +21,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
+from coim.angles import wrap_angle
 from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step, idle_rows, leave_idle
 from coim.randomness import restore_generator
 
@@ -34,6 +35,16 @@ class Dynamics(Protocol):
         self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
     ) -> Tensor:
         """Draw next observations ``[*B, S]``: h(s, a, xi) of Eq. 7."""
+
+
+@runtime_checkable
+class AnchoredDynamics(Dynamics, Protocol):
+    """A model that can also say what another state, action or design changes, for `WorldModelEnv.advance_beside`."""
+
+    def means(
+        self, *asked: tuple[Tensor, Tensor, Tensor], generator: torch.Generator | None = None
+    ) -> tuple[Tensor, ...]:
+        """Expect next observations ``[*B, S]`` of several (observation, action, design) by one draw of the model."""
 
 
 class WorldModelEnv(DesignedEnv):
@@ -59,6 +70,8 @@ class WorldModelEnv(DesignedEnv):
 
     Attributes:
         rng: the dream's own generator; its state is all that a dream carries from one call of `advance` to the next.
+        clearance: of ``env``'s bodies, see :meth:`~coim.envs.morph.MorphEnv.clearance`; None if these have none.
+        transfer: of ``env``'s bodies, see :meth:`~coim.envs.morph.MorphEnv.transfer`; None if these have none.
 
     Raises:
         TypeError: if ``env`` is a TransformedEnv, or no body: a `SerialEnv`, an environment without a design.
@@ -91,6 +104,8 @@ class WorldModelEnv(DesignedEnv):
         self.design_spec: Bounded = env.design_spec
         self.observation_scale: Tensor | None = getattr(env, "observation_scale", None)
         self.angle_indices: tuple[int, ...] = getattr(env, "angle_indices", ())
+        self.clearance: Callable[..., Tensor] | None = getattr(env, "clearance", None)
+        self.transfer: Callable[..., Tensor] | None = getattr(env, "transfer", None)
         self._make_specs(env)
         single = self.full_observation_spec_unbatched
         check_reward(
@@ -121,6 +136,52 @@ class WorldModelEnv(DesignedEnv):
         """
         rng = self.rng if generator is None else generator
         next_observation = self.ensemble.sample(observation, action, design, generator=rng)
+        return next_observation, self.reward_fn(observation, action, next_observation, design)
+
+    def advance_beside(
+        self,
+        real: TensorDictBase,
+        observation: Tensor,
+        action: Tensor,
+        design: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Dream one step anchored at a real one: its outcome, and the difference that the model expects.
+
+        ``s'_g = s' + h(s_g, a_g, xi_g) - h(s, a, xi)`` for a real transition (s, a, s') of body xi, by one member's
+        mean: what the model does wrong on both sides alike drops out (CSE, arXiv:2507.07348).
+
+        Args:
+            real: transitions ``[*B]`` with ``observation``, ``action``, ``design`` and ``("next", "observation")``.
+            observation: s_g ``[*B, S]``.
+            action: a_g ``[*B, A]``, in [-1, 1].
+            design: xi_g ``[*B, D]``.
+            generator: of random numbers; default: the dream's own.
+
+        Returns:
+            Next observation ``[*B, S]`` with its angles in (-pi, pi], and reward ``[*B, 1]``. Where nothing differs
+            from the real transition, its next observation to the last bit.
+
+        Raises:
+            TypeError: if the model has no ``means``.
+        """
+        if not isinstance(self.ensemble, AnchoredDynamics):
+            raise TypeError(
+                f"a {type(self.ensemble).__name__} has no means() to anchor with; give it one as AnchoredDynamics has "
+                "it, or imagine without anchoring"
+            )
+        # h predicts a next observation in raw units, also where the network's target is the change. So the difference
+        # holds all that s_g differs by, and the height by which the root was moved is in it: with Delta the change,
+        #   s' + h(s_g, ...) - h(s, ...) = s' + (s_g + Delta_g) - (s + Delta) = s_g + (s' - s) + (Delta_g - Delta).
+        # Adding s_g - s once more would lift the root twice. Where h is exact, h(s, ...) = s' and h(s_g, ...) is left.
+        here = tuple(real[key] for key in ("observation", "action", "design"))
+        there, expected = self.ensemble.means(
+            (observation, action, design), here, generator=self.rng if generator is None else generator
+        )
+        next_observation = real["next", "observation"] + (there - expected)
+        angles = list(self.angle_indices)
+        next_observation[..., angles] = wrap_angle(next_observation[..., angles])
         return next_observation, self.reward_fn(observation, action, next_observation, design)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -230,7 +230,7 @@ class GaussianEnsemble(TensorDictModuleBase):
         batch, device = observation.shape[:-1], observation.device
         source = device if generator is None else generator.device
         if members is None:
-            members = torch.randint(self.num_members, batch, generator=generator, device=source).to(device)
+            members = self._draw_members(batch, device, generator)
         elif not ((members >= 0) & (members < self.num_members)).all():
             raise IndexError(f"members must lie in 0 .. {self.num_members - 1}, got {members.unique().tolist()}")
         if noise is None:
@@ -241,6 +241,27 @@ class GaussianEnsemble(TensorDictModuleBase):
         target = mean + (self._bounded(log_var) / 2).exp() * noise
         target = target * self.targets.std.to(target.dtype) + self.targets.mean.to(target.dtype)
         return self._next(observation, target)
+
+    def means(
+        self, *asked: tuple[Tensor, Tensor, Tensor], generator: torch.Generator | None = None
+    ) -> tuple[Tensor, ...]:
+        """Next observations that one member expects of each transition, the same member for all that is asked.
+
+        Args:
+            asked: (observation ``[*B, (K,) S]``, action ``[*B, (K,) A]``, design ``[*B, (K,) D]``), all of one batch.
+            generator: draws the members, on any device; torch's global one if None.
+
+        Returns:
+            ``[*B, (K,) S]`` for each of ``asked``: equal to the last bit where these are.
+        """
+        first = asked[0][0]
+        members = self._draw_members(first.shape[:-1], first.device, generator)
+        return tuple(self.sample(*one, members=members, noise=torch.zeros_like(one[0])) for one in asked)
+
+    def _draw_members(self, batch: torch.Size, device: torch.device, generator: torch.Generator | None) -> Tensor:
+        """Draw a member for each transition, uniformly."""
+        source = device if generator is None else generator.device
+        return torch.randint(self.num_members, batch, generator=generator, device=source).to(device)
 
     def _predict(self, observation: Tensor, action: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_var = self.network(self.inputs(torch.cat([observation, action, design], -1))).chunk(2, -1)

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule
 
@@ -29,6 +30,13 @@ from .runs import check_num_runs
 # Evaluated at a time: on a CPU what keeps the activations in the cache of a core, elsewhere what fits into memory.
 CHUNK_ROWS = {"cpu": 2_000}
 MANY_ROWS = 100_000
+
+
+class Transferring(Protocol):
+    """Bodies that know how a state of one looks under another, such as :class:`coim.MorphEnv`."""
+
+    def transfer(self, observation: Tensor, design: Tensor, new_design: Tensor) -> Tensor:
+        """Put states ``[*B, S]`` of bodies ``[*B, D]`` under others ``[*B, D]``, the batches broadcast: ``[*B, S]``."""
 
 
 class DesignValue(LossModule):
@@ -54,6 +62,8 @@ class DesignValue(LossModule):
             fleet.  When called: if designs are not ``[P, D]`` or not finite.
 
     Note:
+        Start states are the paper's. Rows of Replay_Pop in their place average over the states that were visited.
+
         For a fleet, cut out one run with :func:`~coim.models.select_run` first: designs are chosen run by run.
 
         The networks of :mod:`coim.models` are asked on bare tensors, without the TensorDict and the log-density that
@@ -72,10 +82,12 @@ class DesignValue(LossModule):
         """Keys that ``set_keys`` changes.
 
         Attributes:
+            observation: what the networks read of a state, and what is matched.
             design: where the networks read the query.
             state_action_value: written by the critics.
         """
 
+        observation: NestedKey = "observation"
         design: NestedKey = "design"
         state_action_value: NestedKey = "state_action_value"
 
@@ -98,6 +110,8 @@ class DesignValue(LossModule):
         *,
         chunk_size: int | None = None,
         precision: Literal["float32", "bfloat16"] = "float32",
+        start_states_are: Literal["stored", "matched"] = "stored",
+        env: Transferring | None = None,
     ) -> None:
         super().__init__()
         if start_states.batch_dims != 1 or not len(start_states):
@@ -108,6 +122,7 @@ class DesignValue(LossModule):
             raise ValueError(f"chunk_size={chunk_size} must be at least 1, or None to fit the cache")
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
+        self._transfer = _transfer_of(env, start_states_are)
         check_num_runs(None, policy, qvalue)
         self.convert_to_functional(policy, "policy")
         self.convert_to_functional(qvalue, "qvalue")
@@ -145,16 +160,15 @@ class DesignValue(LossModule):
         designs = tensordict[self.tensor_keys.design]
         self._check(designs)
         weights, states = (self.policy_params.data, self.qvalue_params.data), self.start_states
-        inputs = designs
         if self.precision == "bfloat16":
-            weights, states, inputs = tuple(w.bfloat16() for w in weights), states.bfloat16(), designs.bfloat16()
+            weights, states = tuple(w.bfloat16() for w in weights), states.bfloat16()
         evaluate = self._bare_chunk if self._networks_are_bare() else self._chunk
         with (
             torch.set_grad_enabled(torch.is_grad_enabled() and designs.requires_grad),
             weights[0].to_module(self.policy, preserve_module_state=False),
             weights[1].to_module(self.qvalue, preserve_module_state=False),
         ):
-            q = [evaluate(states, chunk).to(designs.dtype) for chunk in inputs.chunk(self._num_chunks(designs))]
+            q = [evaluate(states, chunk).to(designs.dtype) for chunk in designs.chunk(self._num_chunks(designs))]
         value = torch.cat([design_value(part) for part in q])
         return TensorDict({"design_value": value}, value.shape)
 
@@ -162,9 +176,9 @@ class DesignValue(LossModule):
         """Whether both can be asked on bare tensors, as a `coim.models.Policy` and `coim.models.QValue` that were left
         as they were made.
         """
-        keys = (self.tensor_keys.design, self.tensor_keys.state_action_value)
+        keys = (self.tensor_keys.observation, self.tensor_keys.design, self.tensor_keys.state_action_value)
         methods = hasattr(self.policy, "deterministic_action") and hasattr(self.qvalue, "values")
-        if keys != ("design", "state_action_value") or not methods:
+        if keys != ("observation", "design", "state_action_value") or not methods:
             return False
         plain = called_as(self.policy, ProbabilisticActor) and called_as(self.qvalue, TensorDictModule)
         return plain and self.policy[-1].distribution_class is TanhNormal and not self.policy[-1].distribution_kwargs
@@ -177,14 +191,29 @@ class DesignValue(LossModule):
     def _chunk(self, states: TensorDictBase, designs: Tensor) -> Tensor:
         """Values ``[P, n, N]`` by any TensorDict modules."""
         rows = states.expand(len(designs), len(states))
-        rows.set(self.tensor_keys.design, designs.unsqueeze(1).expand(-1, len(states), -1))
+        if self._transfer is not None:
+            rows.set(self.tensor_keys.observation, self._observed(states, designs))
+        rows.set(self.tensor_keys.design, self._query(designs))
         return self.qvalue(self.policy(rows))[self.tensor_keys.state_action_value]
 
     def _bare_chunk(self, states: TensorDictBase, designs: Tensor) -> Tensor:
         """Values ``[P, n, N]`` by networks that take bare tensors."""
-        observation = states["observation"].expand(len(designs), -1, -1)
-        design = designs.unsqueeze(1).expand(-1, len(states), -1)
+        observation, design = self._observed(states, designs), self._query(designs)
         return self.qvalue.values(observation, self.policy.deterministic_action(observation, design), design)
+
+    def _observed(self, states: TensorDictBase, designs: Tensor) -> Tensor:
+        """Observations of all start states under each design, ``[P, n, S]``."""
+        seen = states[self.tensor_keys.observation]
+        if self._transfer is None:
+            return seen.expand(len(designs), -1, -1)
+        # From the states as they were stored: only what the networks read is rounded to their precision.
+        stored, own = self.start_states[self.tensor_keys.observation], self.start_states[self.tensor_keys.design]
+        return self._transfer(stored, own, designs.unsqueeze(1)).to(seen.dtype)
+
+    def _query(self, designs: Tensor) -> Tensor:
+        """The designs for all start states, ``[P, n, D]``, in the precision of the networks."""
+        design = designs.bfloat16() if self.precision == "bfloat16" else designs
+        return design.unsqueeze(1).expand(-1, len(self.start_states), -1)
 
     def _check(self, designs: Tensor) -> None:
         size = self.start_states.get(self.tensor_keys.design, designs).shape[-1]
@@ -193,3 +222,23 @@ class DesignValue(LossModule):
         if not designs.isfinite().all():
             bad = (~designs.isfinite().all(-1)).nonzero().flatten().tolist()
             raise ValueError(f"designs {bad} have NaN or infinite entries; project them with design_spec.project()")
+        if self._transfer is not None and self.tensor_keys.design not in self.start_states.keys(True):
+            raise ValueError(
+                f"start states to be matched lack {self.tensor_keys.design!r}, the bodies that they were seen with; "
+                "give rows of Replay_s0 or Replay_Pop as they are"
+            )
+
+
+def _transfer_of(env: Transferring | None, start_states_are: str) -> Callable[[Tensor, Tensor, Tensor], Tensor] | None:
+    """What puts start states under the query: nothing, if they stay as they are stored."""
+    if start_states_are not in ("stored", "matched"):
+        raise ValueError(f"start_states_are={start_states_are!r} is unknown; choose 'stored' or 'matched'")
+    if start_states_are == "stored":
+        return None
+    if env is None:
+        raise ValueError("start states are matched by the bodies' transfer(); pass env, or leave the states 'stored'")
+    if isinstance(env, TransformedEnv):
+        raise TypeError("states are matched as the bodies themselves observe them; pass env.base_env")
+    if not hasattr(env, "transfer"):
+        raise TypeError(f"a {type(env).__name__} has no transfer() to match states with; pass a MorphEnv")
+    return env.transfer

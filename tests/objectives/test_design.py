@@ -2,8 +2,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
+from coim.buffers import transition_rows
+from coim.envs import HopperMorph
 from coim.models import make_policy, make_qvalue
 from coim.objectives import DesignValue
 
@@ -172,3 +174,91 @@ def test_rows_that_a_buffer_overwrites_later_change_no_value(parts):
     before = fitness(designs(3))
     parts[-1]["observation"].fill_(9.0)
     assert torch.equal(fitness(designs(3)), before)
+
+
+@pytest.fixture
+def hopper_parts():
+    """Hoppers, networks in float64, and start states of five bodies."""
+    torch.manual_seed(0)
+    env = HopperMorph(num_runs=5, seed=0)
+    policy, qvalue = make_policy(env, num_cells=(8,)).double(), make_qvalue(env, num_cells=(8,)).double()
+    starts = env.reset(TensorDict({"design": hoppers(5).float()}, [5])).select("observation", "design").double()
+    return env, policy, qvalue, starts
+
+
+def hoppers(count, seed=0):
+    return 0.5 + 1.5 * torch.rand(count, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_matched_start_states_are_those_of_the_query(hopper_parts):
+    env, policy, qvalue, starts = hopper_parts
+    queries = hoppers(4, seed=1)
+    matched = DesignValue(policy, qvalue, starts, start_states_are="matched", env=env)
+    for query, value in zip(queries, matched(queries)):
+        moved = env.transfer(starts["observation"], starts["design"], query)
+        own = TensorDict({"observation": moved, "design": query.expand(5, -1)}, [5])
+        torch.testing.assert_close(DesignValue(policy, qvalue, own)(query[None])[0], value)
+    start = env.reset(TensorDict({"design": queries[:1].expand(5, -1).float()}, [5]))["observation"]
+    moved = env.transfer(starts["observation"], starts["design"], queries[0])
+    torch.testing.assert_close(moved[:, 0], start[:, 0].double(), atol=0.011, rtol=0)  # both with reset noise
+
+
+def test_stored_start_states_stay_the_default_and_bodies_change_nothing_then(hopper_parts):
+    env, policy, qvalue, starts = hopper_parts
+    queries = hoppers(4, seed=1)
+    plain = DesignValue(policy, qvalue, starts)(queries)
+    assert torch.equal(DesignValue(policy, qvalue, starts, env=env)(queries), plain)
+    matched = DesignValue(policy, qvalue, starts, start_states_are="matched", env=env)(queries)
+    assert (matched - plain).abs().min() > 1e-6
+
+
+def test_the_gradient_of_matched_states_sees_how_the_root_rises(hopper_parts):
+    env, policy, qvalue, starts = hopper_parts
+    queries = hoppers(3, seed=1).requires_grad_()
+    matched = DesignValue(policy, qvalue, starts, start_states_are="matched", env=env)
+    assert torch.autograd.gradcheck(matched, (queries,))
+    (seen,) = torch.autograd.grad(matched(queries).sum(), queries)
+    (unseen,) = torch.autograd.grad(DesignValue(policy, qvalue, starts)(queries).sum(), queries)
+    assert not torch.allclose(seen, unseen)
+
+
+def test_matched_states_are_the_same_for_networks_of_any_kind_and_in_chunks(hopper_parts):
+    env, policy, qvalue, starts = hopper_parts
+    queries = hoppers(7, seed=1)
+    value = DesignValue(policy, qvalue, starts, start_states_are="matched", env=env)(queries)
+    wrapped = [TensorDictSequential(module) for module in (policy, qvalue)]
+    for chunk_size in (1, 3, None):
+        other = DesignValue(*wrapped, starts, start_states_are="matched", env=env, chunk_size=chunk_size)
+        torch.testing.assert_close(other(queries), value)
+
+
+def test_matched_states_in_bfloat16_are_transferred_before_they_are_rounded(hopper_parts):
+    env, policy, qvalue, starts = hopper_parts
+    networks, starts, queries = (policy.float(), qvalue.float()), starts.float(), hoppers(6, seed=1).float()
+    exact, rounded = (
+        DesignValue(*networks, starts, start_states_are="matched", env=env, precision=precision)(queries)
+        for precision in ("float32", "bfloat16")
+    )
+    torch.testing.assert_close(rounded, exact, atol=0.02, rtol=0.02)
+
+
+def test_visited_states_can_stand_in_for_start_states(hopper_parts):
+    env, policy, qvalue, _ = hopper_parts
+    visited = transition_rows(env.rollout(20)).flatten().double()
+    value = DesignValue(policy, qvalue, visited, start_states_are="matched", env=env)(hoppers(3))
+    assert value.isfinite().all()
+
+
+def test_states_that_cannot_be_matched_are_named(hopper_parts):
+    env, policy, qvalue, starts = hopper_parts
+    with pytest.raises(ValueError, match="start_states_are='moved' is unknown; choose 'stored' or 'matched'"):
+        DesignValue(policy, qvalue, starts, start_states_are="moved")
+    with pytest.raises(ValueError, match="pass env, or leave the states 'stored'"):
+        DesignValue(policy, qvalue, starts, start_states_are="matched")
+    with pytest.raises(TypeError, match=r"pass env\.base_env"):
+        DesignValue(policy, qvalue, starts, start_states_are="matched", env=TransformedEnv(env))
+    with pytest.raises(TypeError, match=r"a Tensor has no transfer\(\)"):
+        DesignValue(policy, qvalue, starts, start_states_are="matched", env=torch.ones(1))
+    bare = DesignValue(policy, qvalue, starts.select("observation"), start_states_are="matched", env=env)
+    with pytest.raises(ValueError, match="start states to be matched lack 'design'"):
+        bare(hoppers(2))
