@@ -18,6 +18,7 @@ COMMANDS = {
     "figures": "draw the figures of a study",
     "retrain": "train the best bodies of a study again from scratch",
     "archive": "copy the tables of a study, without its checkpoints",
+    "check": "show what this machine has, and what will be slow or missing",
     "model-error": "measure the error of the learnt dynamics during a run",
 }
 

@@ -41,9 +41,18 @@ def now() -> str:
 
 
 def git_revision() -> str | None:
-    """Commit of the checkout that this file lies in, with ``-dirty`` where it was changed; None outside of one."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    """Commit of the checkout that this file belongs to, with ``-dirty`` where it was changed.
+
+    Returns:
+        None outside of a checkout; also where coim is installed somewhere inside of another project's.
+    """
+    here = Path(__file__)
+    describe = ["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        said = [
+            subprocess.run(["git", "-C", here.parent, *words], capture_output=True, text=True, check=True).stdout
+            for words in (["ls-files", "--error-unmatch", here.name], describe)
+        ]
     except (OSError, subprocess.CalledProcessError):
         return None
+    return said[-1].strip()
