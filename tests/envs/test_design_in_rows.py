@@ -49,7 +49,6 @@ def test_a_step_needs_no_design_and_takes_one_that_was_only_rounded() -> None:
         assert after["design"].equal(torch.full((2, 4), 1.3))
 
 
-@pytest.mark.filterwarnings("ignore:Creating .*WeightUpdater:DeprecationWarning")  # torchrl's own import
 def test_a_collector_draws_a_body_per_episode_with_a_primer_before_the_reset() -> None:
     from torchrl.collectors import Collector
 
