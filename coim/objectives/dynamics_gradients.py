@@ -1,6 +1,7 @@
-r"""The gradients of Eq. 6, written out: what `EnsembleNLLLoss` and autograd compute, by the fastest products there are.
+r"""The gradients of Eq. 6, written out: the same as those of `EnsembleNLLLoss` by autograd, in less time.
 
-`EnsembleNLLLoss` stays the definition; tests hold this to it.
+This is what `coim.DynamicsLearner` trains with. `EnsembleNLLLoss` is the definition;
+``tests/objectives/test_dynamics_gradients.py`` holds the two equal.
 
 Shapes: B batch, G members (of all runs, leading where networks are stacked along them), F input features, S state.
 

@@ -1,7 +1,8 @@
-r"""The gradients of Eq. 7-8, written out: what `CoImSACLoss` and autograd compute, without what they compute in vain.
+r"""The gradients of Eq. 7-8, written out: the same as those of `CoImSACLoss` by autograd, in less time.
 
-The policy sees both states in one product and the critics both actions, only gradients that an optimiser needs are
-made, and nothing is recorded. `CoImSACLoss` stays the definition; tests hold this to it.
+The policy evaluates both states in one product, and the critics both actions. Only the gradients that an optimiser
+needs are computed, and no graph is recorded. This is what `coim.SACLearner` trains with. `CoImSACLoss` is the
+definition; ``tests/objectives/test_gradients.py`` holds the two equal.
 
 Shapes: B batch, K runs (leading where networks are stacked along them), N critics, S observation, D design, A action.
 
