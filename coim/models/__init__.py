@@ -1,4 +1,4 @@
-"""Networks: the design-conditioned policy and critics, the dynamics ensemble, and the stack they are made of."""
+"""Networks: the design-conditioned policy and critics, the dynamics ensemble, and the stacked layers of both."""
 
 from .ensemble import GaussianEnsemble
 from .normaliser import RunningNormaliser

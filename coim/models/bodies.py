@@ -1,4 +1,4 @@
-"""What networks must know of the body in an environment, through whatever the environment is wrapped in.
+"""Read from an environment what its networks need, also through transforms and batched environments.
 
 Shapes: ``D`` design.
 """
@@ -16,14 +16,14 @@ def body_of(env: EnvBase) -> tuple[EnvBase, bool]:
     """Find the environment inside of transforms and of `SerialEnv`, `ParallelEnv` or `AsyncEnvPool`.
 
     Args:
-        env: any environment; what is not wrapped is its own body. Of the workers of a batched one, another of each is
-            made to look at; torch's global generator stays as it is.
+        env: any environment; one without wrappers is returned as it is. To see the workers of a batched environment,
+            another one of each is made; torch's global generator is not changed.
 
     Returns:
         The bare environment, and whether a transform rewrites its ``observation``.
 
     Raises:
-        ValueError: if the workers have bodies of different classes, or some have transforms that others have not.
+        ValueError: if the workers have bodies of different classes, or only some of them have transforms.
     """
     if isinstance(env, TransformedEnv):
         body, rewritten = body_of(env.base_env)
@@ -46,10 +46,10 @@ def _workers(env: BatchedEnvBase | AsyncEnvPool) -> list[EnvBase]:
 
 
 def observed(env: EnvBase) -> TensorSpec:
-    """Spec of what networks read as ``observation``, transforms included.
+    """Return the spec of ``observation`` as networks read it, after all transforms.
 
     Raises:
-        ValueError: if there is no such entry, as behind a transform that gives it another name.
+        ValueError: if there is no such entry, for example after a transform that renames it.
     """
     if "observation" not in env.observation_spec.keys():  # noqa: SIM118
         raise ValueError(
@@ -60,13 +60,13 @@ def observed(env: EnvBase) -> TensorSpec:
 
 
 def design_bounds(env: EnvBase) -> tuple[Tensor, Tensor, Tensor]:
-    """Bounds of the design as networks see it: where the observation has it, transforms included.
+    """Return the bounds of the design as networks read it, after all transforms.
 
     Args:
-        env: with ``design`` in its ``observation_spec``, or with ``design_spec``.
+        env: has ``design`` in its ``observation_spec``, or has a ``design_spec``.
 
     Returns:
-        Least and greatest design and which entries have both bounds, each ``[D]``.
+        Lowest design, highest design, and which entries have both bounds, each ``[D]``.
 
     Raises:
         ValueError: if the bounds are not the same in all rows of the environment.

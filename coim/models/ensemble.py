@@ -29,8 +29,8 @@ from .normaliser import RunningNormaliser
 from .stacked import StackedMLP
 
 # Range of the log-variance of the standardised target: Chua et al.'s initial bounds, kept fixed.  Standardised targets
-# have variance 1, so that a member that knows nothing stays inside; exp(-10) is a noise of 0.7 % of their spread, and
-# keeps a deterministic simulator from driving the density to infinity.
+# have variance 1, which is inside.  exp(-10) is a standard deviation of 0.7 % of their spread: without this bound, a
+# deterministic simulator would drive the density to infinity.
 LOG_VAR_RANGE = (-10.0, 0.5)
 
 
@@ -40,8 +40,8 @@ class GaussianEnsemble(TensorDictModuleBase):
     Member i is :math:`\mathcal N(\mu_{\psi^i}(s, a, \xi), \Sigma_{\psi^i}(s, a, \xi))` with diagonal covariance, over
     the *standardised target*: the next observation or its change, centred and scaled by the running statistics that
     :meth:`update_statistics` keeps.  As a TensorDict module it reads ``observation``, ``action``, ``design`` and writes
-    the parameters of that Gaussian, ``mean`` and ``log_var``, each ``[*B, (K,) E, S]``.  In raw units:
-    :meth:`moments`, :meth:`sample`.
+    the parameters of that Gaussian, ``mean`` and ``log_var``, each ``[*B, (K,) E, S]``.  :meth:`moments` and
+    :meth:`sample` are in raw units.
 
     Args:
         num_observations: ``S``.
@@ -51,8 +51,8 @@ class GaussianEnsemble(TensorDictModuleBase):
         num_cells: units of each hidden layer.
         predict: ``"delta"``, the change of the observation, or ``"next"``, the next observation itself (Eq. 6 as
             printed).
-        angle_indices: entries of the observation that are angles in (-pi, pi] rad.  Their change is wrapped, and so is
-            what is predicted for them.
+        angle_indices: entries of the observation that are angles in (-pi, pi] rad.  Their changes and their predictions
+            are wrapped.
         min_design_std: lower bound of the standard deviation by which design entries are scaled, ``[D]``.
         num_runs: ``K`` independent ensembles in one; the last batch dimension of their input is then the run axis.
 
@@ -120,22 +120,22 @@ class GaussianEnsemble(TensorDictModuleBase):
     ) -> GaussianEnsemble:
         """Build an ensemble that fits an environment (Sec. 6.1: three members, three hidden layers of 500 units).
 
-        Design entries are scaled by at least the standard deviation of a uniform draw within their bounds: after one
-        design, or two near ones, the running statistics alone would magnify any other design beyond all data. Weights
-        are drawn on the CPU, and then go to the device and dtype of the observations.
+        Design entries are divided by at least the standard deviation of a uniform draw within their bounds. After one
+        design, or two similar ones, the running deviation is near 0, and any other design would become a huge input.
+        Weights are drawn on the CPU, and then moved to the device and dtype of the observations.
 
         Args:
-            env: anything with ``observation_spec``, ``action_spec`` and bounds of the design, in the observation's spec
-                or as ``design_spec``; where entries of the observation are angles in (-pi, pi] rad, the body inside of
-                it has ``angle_indices``.
+            env: any environment with ``observation_spec``, ``action_spec`` and bounds of the design, in the spec of its
+                observation or as ``design_spec``. If entries of the observation are angles in (-pi, pi] rad, its body
+                has ``angle_indices``.
             num_members: ``E``.
             num_cells: units of each hidden layer.
             predict: ``"delta"`` or ``"next"``.
             num_runs: ``K``, or None for a single run.
 
         Raises:
-            ValueError: if a transform rewrites observations in which there are angles, there is no ``observation``, or
-                the workers of ``env`` are not alike.
+            ValueError: if a transform changes observations that contain angles, there is no ``observation``, or the
+                workers of ``env`` differ.
         """
         seen = observed(env)
         body, rewritten = body_of(env)
@@ -174,7 +174,7 @@ class GaussianEnsemble(TensorDictModuleBase):
         """Merge rows of Replay_Pop into the running statistics of inputs and targets.
 
         Args:
-            rows: ``[*B, (K)]``, each row once in its life, with ``observation``, ``action``, ``design`` and
+            rows: ``[*B, (K)]``, each row only once, with ``observation``, ``action``, ``design`` and
                 ``("next", "observation")``.
         """
         inputs = [rows[key] for key in self.in_keys]
@@ -182,11 +182,11 @@ class GaussianEnsemble(TensorDictModuleBase):
         self.targets.update(self._target(inputs[0], rows["next", self.in_keys[0]]))
 
     def standardised_target(self, observation: Tensor, next_observation: Tensor) -> Tensor:
-        """What the members predict: the (change of the) next observation, centred and scaled, ``[*B, (K,) S]``."""
+        """Return the target of the members: the (change of the) next observation, standardised, ``[*B, (K,) S]``."""
         return self.targets(self._target(observation, next_observation))
 
     def moments(self, observation: Tensor, action: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the next observation in raw units, member by member.
+        """Return mean and variance of the next observation for each member, in raw units.
 
         Args:
             observation: ``[*B, (K,) S]``.
@@ -245,14 +245,15 @@ class GaussianEnsemble(TensorDictModuleBase):
     def means(
         self, *asked: tuple[Tensor, Tensor, Tensor], generator: torch.Generator | None = None
     ) -> tuple[Tensor, ...]:
-        """Next observations that one member expects of each transition, the same member for all that is asked.
+        """Return the mean next observations of several queries: one member per transition, the same for all queries.
 
         Args:
-            asked: (observation ``[*B, (K,) S]``, action ``[*B, (K,) A]``, design ``[*B, (K,) D]``), all of one batch.
+            asked: queries (observation ``[*B, (K,) S]``, action ``[*B, (K,) A]``, design ``[*B, (K,) D]``) of one batch
+                shape.
             generator: draws the members, on any device; torch's global one if None.
 
         Returns:
-            ``[*B, (K,) S]`` for each of ``asked``: equal to the last bit where these are.
+            ``[*B, (K,) S]`` for each query; equal queries have equal results, to the last bit.
         """
         first = asked[0][0]
         members = self._draw_members(first.shape[:-1], first.device, generator)
@@ -279,12 +280,12 @@ class GaussianEnsemble(TensorDictModuleBase):
         return self.wrapped(observation + target if self.predict == "delta" else target)
 
     def wrapped(self, x: Tensor) -> Tensor:
-        """Bring the angles among observations, or among differences of them, into (-pi, pi], ``[*B, S]``."""
+        """Wrap the angles in observations, or in differences of observations, to (-pi, pi], ``[*B, S]``."""
         return torch.where(self.is_angle, wrap_angle(x), x) if self.angle_indices else x
 
     def _grouped(self, inputs: Tensor, members: Tensor) -> Tensor:
-        """Run each member on its own rows only: ``[*B, (K,) F], [*B, (K)] -> [*B, (K,) 2 S]``."""
-        if not called_as(self.network, StackedMLP):  # it may do more than its layers do
+        """Evaluate each member on its own rows only: ``[*B, (K,) F], [*B, (K)] -> [*B, (K,) 2 S]``."""
+        if not called_as(self.network, StackedMLP):  # a hook or another forward may do more than the layers
             every = self.network(inputs)
             return every.take_along_dim(members[..., None, None], -2).squeeze(-2)
         runs = self.num_runs or 1
@@ -308,7 +309,7 @@ class GaussianEnsemble(TensorDictModuleBase):
         return out
 
     def _grouped_chunk(self, rows: Tensor, group: Tensor) -> Tensor:
-        """Sort ``[R, F]`` into equally long, zero-padded groups, evaluate these, and put their rows back in order."""
+        """Sort ``[R, F]`` into zero-padded groups of one length, evaluate them, and restore the order of the rows."""
         num_groups = self.num_members * (self.num_runs or 1)
         counts = torch.bincount(group, minlength=num_groups)
         longest, starts = int(counts.max()), counts.cumsum(0) - counts

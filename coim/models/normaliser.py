@@ -1,4 +1,4 @@
-"""Running statistics by which networks see their inputs and targets centred and scaled.
+"""Running statistics to standardise the inputs and targets of networks.
 
 Shapes: ``B`` batch, ``K`` runs, ``F`` features.
 
@@ -18,8 +18,7 @@ from torch import Tensor, nn
 class RunningNormaliser(nn.Module):
     """Mean and standard deviation of all rows ever seen, feature by feature, in float64.
 
-    ``.to`` moves it to another device and leaves it in float64, whatever dtype is asked for: a count in bfloat16 ends
-    at 256.
+    ``.to`` moves it to another device, but always leaves it in float64: a count in bfloat16 could not go beyond 256.
 
     Args:
         num_features: ``F``.
@@ -27,7 +26,7 @@ class RunningNormaliser(nn.Module):
         min_std: lower bound of the standard deviation of each feature, ``[F]``; zero by default.
 
     Note:
-        A feature that never varied by more than a millionth (of its mean, where that is above 1) is centred but not
+        A feature with a standard deviation below a millionth (of its mean, if that is above 1) is centred but not
         scaled.
 
     Example:
@@ -54,7 +53,7 @@ class RunningNormaliser(nn.Module):
 
     @property
     def std(self) -> Tensor:
-        """Standard deviation of each feature, ``[(K,) F]``; ones where nothing was seen or nothing varied."""
+        """Standard deviation of each feature, ``[(K,) F]``; 1 for features without data or without variation."""
         std = (self.square_sum / self.count.clamp(min=1)).sqrt()
         varied = std > 1e-6 * self.mean.abs().clamp(min=1)
         return torch.where(varied | (self.min_std > 0), std.maximum(self.min_std), torch.ones_like(std))
@@ -67,7 +66,7 @@ class RunningNormaliser(nn.Module):
             rows: ``[*B, (K,) F]``, any number of them.
 
         Raises:
-            ValueError: if they do not end in ``[(K,) F]``: the rows of one run would count as another's.
+            ValueError: if the shape does not end in ``[(K,) F]``: rows would be counted for the wrong run.
         """
         if rows.shape[-self.mean.ndim :] != self.mean.shape:
             raise ValueError(f"rows of shape {list(rows.shape)} must end in {list(self.mean.shape)}")
@@ -85,14 +84,14 @@ class RunningNormaliser(nn.Module):
         return (x - self.mean.to(x.dtype)) / self.std.to(x.dtype)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Follow to another device, not to another dtype."""
+        """Move to another device, but keep the dtype."""
         for name, statistics in list(self.named_buffers()):
             moved = fn(statistics)
             self.register_buffer(name, moved if moved.dtype == statistics.dtype else statistics.to(moved.device))
         return self
 
     def keep_run(self, run: int) -> None:
-        """Drop all runs but one, in place; see :func:`~coim.models.select_run`."""
+        """Keep one run only, in place; see :func:`~coim.models.select_run`."""
         for name, buffer in list(self.named_buffers()):
             setattr(self, name, buffer[run].clone())
         self.num_runs = None

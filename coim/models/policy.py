@@ -71,10 +71,10 @@ class PolicyNetwork(nn.Module):
         return loc, log_scale.clamp(*LOG_SCALE_RANGE).exp()
 
     def for_design(self, design: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-        """Prepare `forward` for the steps of an episode, in which the designs stay; see `Policy.is_unaltered`.
+        """Return a faster `forward` for an episode, in which the designs are constant; see `Policy.is_unaltered`.
 
-        Everything is looked up, scaled and laid out once; the arithmetic is the same. The weights are read at each
-        call, so that it follows a learner that writes to them in place.
+        Look-ups, the scaling of the design and the memory layout are done once; the arithmetic is the same. Each call
+        reads the weights, so the function follows a learner that changes them in place.
 
         Args:
             design: ``[K, D]``, a row for each body.
@@ -132,7 +132,7 @@ class Policy(ProbabilisticActor):
         return self.module[0].module
 
     def deterministic_action(self, observation: Tensor, design: Tensor) -> Tensor:
-        """The mode's action ``tanh(loc)``, on bare tensors: ``[*B, (K,) S], [*B, (K,) D] -> [*B, (K,) A]``."""
+        """Return the deterministic action ``tanh(loc)``: ``[*B, (K,) S], [*B, (K,) D] -> [*B, (K,) A]``."""
         return self.network(observation, design)[0].tanh()
 
     @property
@@ -141,9 +141,9 @@ class Policy(ProbabilisticActor):
         return self.network.mlp.num_runs
 
     def is_unaltered(self) -> bool:
-        """Whether calling the policy does what its class and `PolicyNetwork.for_design` do.
+        """Return whether calling the policy gives the same result as `PolicyNetwork.for_design`.
 
-        It does not with another activation or distribution, with hooks, or with a `forward` of its own anywhere.
+        It does not if any part has another activation or distribution, hooks, or a `forward` of its own.
         """
         actor = (Policy, TensorDictModule, SafeProbabilisticModule)
         network = (PolicyNetwork, InputScaling, StackedMLP, nn.ModuleList, StackedLinear, nn.ReLU)
@@ -156,19 +156,19 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
     """Build a policy that fits an environment (Sec. 6.1: three hidden layers of 200 units).
 
     Args:
-        env: anything with ``observation_spec``, ``action_spec`` and bounds of the design, in the observation's spec or
-            as ``design_spec``: a body, its dream, or one of these inside of transforms, `SerialEnv` or `ParallelEnv`.
-            What the inputs are scaled by is the same for all of them, see :meth:`InputScaling.for_env`.
+        env: any environment with ``observation_spec``, ``action_spec`` and bounds of the design, in the spec of its
+            observation or as ``design_spec``: a body, its dream, or one of these inside of transforms, `SerialEnv` or
+            `ParallelEnv`. The scaling of the inputs is the same for all of them, see :meth:`InputScaling.for_env`.
         num_cells: units of each hidden layer.
         num_runs: ``K`` independent policies in one; the last batch dimension of their input is then the run axis.
 
     Returns:
-        A policy on the device and in the dtype of the observations. Weights are drawn on the CPU: the same seed gives
-        the same policy on each device.
+        A policy on the device and in the dtype of the observations. Weights are drawn on the CPU: a seed gives the same
+        policy on every device.
 
     Raises:
-        ValueError: if the actions of ``env`` are not bounded by -1 and 1, it has no ``observation``, or its workers are
-            not alike.
+        ValueError: if the actions of ``env`` are not bounded by -1 and 1, it has no ``observation``, or its workers
+            differ.
 
     Example:
         >>> policy = Policy(PolicyNetwork(17, 6, 6))
@@ -178,7 +178,7 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
     """
     space = env.action_spec.space
     if not hasattr(space, "low") or not (torch.all(space.low == -1) and torch.all(space.high == 1)):
-        raise ValueError(f"a tanh acts in [-1, 1], not in {space}; rescale with torchrl.envs.ActionScaling")
+        raise ValueError(f"a tanh policy acts in [-1, 1], not in {space}; rescale with torchrl.envs.ActionScaling")
     seen, scaling = observed(env), InputScaling.for_env(env)
     with torch.device("cpu"):
         network = PolicyNetwork(

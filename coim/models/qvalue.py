@@ -65,7 +65,7 @@ class QValueNetwork(nn.Module):
 class QValue(TensorDictModule):
     """The critics as a TensorDict module: reads ``observation``, ``action``, ``design``; writes ``state_action_value``.
 
-    With one critic its output ``[*B, 1]`` is what TorchRL's losses expect of a critic.
+    With one critic, its output ``[*B, 1]`` has the shape that TorchRL's losses expect.
 
     Args:
         network: kept as ``qvalue.module``.
@@ -75,7 +75,7 @@ class QValue(TensorDictModule):
         super().__init__(network, in_keys=["observation", "action", "design"], out_keys=["state_action_value"])
 
     def values(self, observation: Tensor, action: Tensor, design: Tensor) -> Tensor:
-        """All critics on bare tensors, see :meth:`QValueNetwork.forward`."""
+        """Evaluate all critics on tensors, see :meth:`QValueNetwork.forward`."""
         return self.module(observation, action, design)
 
     @property
@@ -100,7 +100,7 @@ def make_qvalue(
         Critics on the device and in the dtype of the observations; their weights are drawn on the CPU.
 
     Raises:
-        ValueError: if the workers of ``env`` are not alike.
+        ValueError: if the workers of ``env`` differ.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Bringing the inputs of policy and critics to one magnitude.
+"""Scale the inputs of policy and critics to similar magnitudes.
 
 Shapes: ``B`` batch, ``S`` state, ``D`` design.
 """
@@ -13,17 +13,17 @@ from .bodies import body_of, design_bounds
 
 
 class InputScaling(nn.Module):
-    """Observations over their typical spread, designs from their bounds to [-1, 1].
+    """Divide observations by their typical spread, and map designs from their bounds to [-1, 1].
 
-    Joint velocities are twenty times joint angles, and without scaling a network sees little else (what that costs is
-    in docs/results). The spreads are constants of the body, not statistics of
-    what was seen: they are the same for every arm, run and network, targets included, and nothing has to be kept up.
+    Joint velocities are twenty times as large as joint angles, and would dominate the input without scaling
+    (docs/results has the cost). The spreads are constants of the body, not running statistics: they never change, and
+    are the same for all arms, seeds and networks, target critics included.
 
     Args:
         observation_scale: typical spread of each entry, ``[S]``.
-        low: least design, ``[D]``.
-        high: greatest design, ``[D]``.
-        bounded: which entries of the design have both bounds, ``[D]``; the others are left as they are. None: all.
+        low: lowest design, ``[D]``.
+        high: highest design, ``[D]``.
+        bounded: which entries of the design have both bounds, ``[D]``; the others are not scaled. None: all have.
 
     Raises:
         ValueError: if a spread or a range is not positive.
@@ -54,11 +54,11 @@ class InputScaling(nn.Module):
 
     @classmethod
     def for_env(cls, env: EnvBase) -> InputScaling:
-        """The scaling of an environment: the ``observation_scale`` of its body and the bounds of its designs.
+        """Make the scaling of an environment from its body's ``observation_scale`` and the bounds of its designs.
 
         It is the same for a body, for its dream, and for both inside of transforms or of several workers. Observations
-        are left as they are where the body has no constants, and where a transform rewrites them: these are no longer
-        the body's, and `ObservationNorm` or `VecNorm` has scaled them already.
+        are not scaled if the body has no constants, or if a transform changes them: the constants then do not fit, and
+        `ObservationNorm` or `VecNorm` has scaled them already.
 
         Args:
             env: as for :func:`~coim.models.make_policy`.
@@ -73,9 +73,9 @@ class InputScaling(nn.Module):
         return cls(scale, low, high, bounded=bounded)
 
     def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
-        """Scale both, ``[*B, S]`` and ``[*B, D]``."""
+        """Scale observation and design, ``[*B, S]`` and ``[*B, D]``."""
         return observation / self.observation_scale, self.scaled_design(design)
 
     def scaled_design(self, design: Tensor) -> Tensor:
-        """Designs from their bounds to [-1, 1], ``[*B, D]``."""
+        """Map designs from their bounds to [-1, 1], ``[*B, D]``."""
         return (design - self.design_centre) / self.design_reach

@@ -1,4 +1,4 @@
-"""The sizes of all networks of a run, in one place: whoever trains them and whoever loads them builds them alike."""
+"""The sizes of all networks of a run, in one place, so that training and loading build the same networks."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class NetworkSizes:
     """Builds the networks of a run.
 
     Attributes:
-        num_runs: K; a single run needs no run axis in its networks and gets none.
+        num_runs: K; the networks of a single run have no run axis.
         num_cells: hidden units of the policy and of each critic.
         num_critics: N.
         model_cells: hidden units of each member of the ensemble.
-        num_members: of the ensemble.
-        predict: what the ensemble's Gaussian is over, see `GaussianEnsemble`.
+        num_members: members of the ensemble.
+        predict: what the ensemble predicts, see `GaussianEnsemble`.
 
     Example:
         >>> from coim import HopperMorph
@@ -43,10 +43,10 @@ class NetworkSizes:
 
     @classmethod
     def among(cls, values: Mapping[str, Any]) -> Self:
-        """Those among many other settings; lists, as JSON has them, become tuples.
+        """Take the sizes from a mapping that may have other settings too; lists, as in JSON, become tuples.
 
         Raises:
-            KeyError: if one of them is missing.
+            KeyError: if a size is missing.
         """
         found: dict[str, Any] = {field.name: values[field.name] for field in fields(cls)}
         found |= {name: tuple(value) for name, value in found.items() if isinstance(value, list)}
@@ -54,19 +54,19 @@ class NetworkSizes:
 
     @property
     def stacked(self) -> int | None:
-        """K, or None where the networks have no run axis."""
+        """K, or None if the networks have no run axis."""
         return self.num_runs if self.num_runs > 1 else None
 
     def policy(self, env: EnvBase) -> Policy:
-        """A policy that fits an environment, with fresh weights."""
+        """Make a policy for an environment, with fresh weights."""
         return make_policy(env, num_cells=self.num_cells, num_runs=self.stacked)
 
     def qvalue(self, env: EnvBase) -> QValue:
-        """Critics that fit an environment, with fresh weights."""
+        """Make critics for an environment, with fresh weights."""
         return make_qvalue(env, num_critics=self.num_critics, num_cells=self.num_cells, num_runs=self.stacked)
 
     def ensemble(self, env: EnvBase) -> GaussianEnsemble:
-        """An ensemble that fits an environment, with fresh weights."""
+        """Make an ensemble for an environment, with fresh weights."""
         return GaussianEnsemble.for_env(
             env,
             num_members=self.num_members,

@@ -1,9 +1,8 @@
 """Many equal multi-layer perceptrons as one batched module.
 
-The critics of one agent, the members of one ensemble and the runs of one experiment are all the same thing: copies of
-one small network.  Their weights are stacked along leading dimensions, so that a layer of all copies is one batched
-matrix product.  Where no gradient is asked for, a CPU is faster with one product after the other, by
-:mod:`coim.products`.
+The critics of one agent, the members of one ensemble and the runs of one fleet are copies of one small network.  Their
+weights are stacked along leading dimensions, so that one batched matrix product computes a layer of all copies.
+Without gradients, a CPU is faster with one product after the other, by :mod:`coim.products`.
 
 Shapes: ``B`` batch, ``K`` runs, ``N`` copies, ``G = K * N`` (1 where neither axis exists), ``R`` rows, ``F`` input
 features, ``O`` output features.
@@ -25,8 +24,8 @@ from coim.products import Activation, affine, emulated
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
-# Without gradients: with fewer rows the set-up of each product costs more than it gains, with more the activations
-# leave the cache of a CPU core.
+# Rows for products without gradients: with fewer, the set-up of each product costs more than it saves; with more, the
+# activations do not fit the cache of a CPU core.
 FEW_ROWS, CHUNK_ROWS = 128, 2_000
 FUSED: dict[type[nn.Module], Activation] = {nn.ReLU: "relu", nn.SiLU: "swish"}
 
@@ -61,7 +60,7 @@ class StackedLinear(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Draw all copies anew and independently, as :class:`torch.nn.Linear` does: U(-1/sqrt(F), 1/sqrt(F))."""
+        """Draw new weights for each copy, as :class:`torch.nn.Linear` does: U(-1/sqrt(F), 1/sqrt(F))."""
         bound = 1 / math.sqrt(self.weight.shape[-2])
         nn.init.uniform_(self.weight, -bound, bound, generator=generator)
         nn.init.uniform_(self.bias, -bound, bound, generator=generator)
@@ -88,8 +87,8 @@ class StackedMLP(nn.Module):
         num_cells: units of each hidden layer.
         num_runs: ``K``, independent runs.  Each run has its own input rows.  None: no run axis.
         num_copies: ``N``, copies that see the same input.  None: no copy axis.
-        activation: class of the nonlinearity after each hidden layer; called with ``inplace=True``, which spares a CPU
-            an eighth of its time.
+        activation: class of the nonlinearity after each hidden layer; made with ``inplace=True``, which saves an eighth
+            of the time on a CPU.
         device: where the weights live.
         dtype: of the weights.
 
@@ -134,7 +133,7 @@ class StackedMLP(nn.Module):
         )
 
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Draw all weights anew, each copy independently.
+        """Draw new weights, independent for each copy.
 
         Args:
             generator: source of the draws, torch's global one if None.
@@ -146,13 +145,13 @@ class StackedMLP(nn.Module):
         """Evaluate every copy on the inputs.
 
         Args:
-            inputs: joined on their last dimension to ``[*B, (K,) F]``.
+            inputs: tensors that are concatenated on their last dimension to ``[*B, (K,) F]``.
 
         Returns:
             ``[*B, (K,) (N,) O]``.
 
         Raises:
-            ValueError: if the inputs have not ``F`` features or their last batch dimension is not the run axis.
+            ValueError: if the inputs do not have ``F`` features, or their last batch dimension is not the run axis.
         """
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
         self._check(x, inputs)
@@ -171,7 +170,7 @@ class StackedMLP(nn.Module):
         """Evaluate each copy on rows of its own.
 
         Args:
-            x: ``[G, R, F]``, the copies of one run beside each other.
+            x: ``[G, R, F]``, with the copies of one run next to each other.
 
         Returns:
             ``[G, R, O]``.
@@ -179,14 +178,14 @@ class StackedMLP(nn.Module):
         return self._product(x) if self.stack else self._product(x.squeeze(0)).unsqueeze(0)
 
     def forward_copy(self, copy: int, x: Tensor) -> Tensor:
-        """Evaluate one copy without gradients, where :meth:`serves_bare` allows it.
+        """Evaluate one copy without gradients, if :meth:`serves_bare` allows it.
 
         Args:
-            copy: in ``0 .. G - 1``, the copies of one run beside each other.
+            copy: in ``0 .. G - 1``, with the copies of one run next to each other.
             x: ``[R, F]``.
 
         Returns:
-            ``[R, O]``, equal to what the other paths give up to rounding.
+            ``[R, O]``, equal to `forward_stacked` up to rounding.
         """
         layers = [
             (layer.weight.flatten(0, -3)[copy], layer.bias.flatten(0, -2)[copy])
@@ -203,10 +202,10 @@ class StackedMLP(nn.Module):
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     def serves_bare(self, x: Tensor, num_rows: int) -> bool:
-        """Whether :meth:`forward_copy` is the better path for ``num_rows`` rows per copy.
+        """Return whether :meth:`forward_copy` is the faster path for ``num_rows`` rows per copy, and allowed.
 
-        That is so for many rows on a CPU while neither autograd nor a function transform nor a compiler looks on, and
-        while layers and activation do nothing else than they were made for.
+        It is for many rows on a CPU, outside of autograd, function transforms and compilers, as long as layers and
+        activation have no hooks and no `forward` of their own.
         """
         return (
             num_rows >= FEW_ROWS
@@ -222,7 +221,7 @@ class StackedMLP(nn.Module):
         )
 
     def keep_run(self, run: int) -> None:
-        """Drop all runs but one, in place; see :func:`select_run`."""
+        """Keep one run only, in place; see :func:`select_run`."""
         for layer in self.layers:
             for name, weights in list(layer.named_parameters()):
                 setattr(layer, name, nn.Parameter(weights.detach()[run].clone(), weights.requires_grad))
@@ -235,7 +234,7 @@ class StackedMLP(nn.Module):
         return x
 
     def _one_by_one(self, x: Tensor) -> Tensor:
-        """Evaluate copy after copy: ``[R, K, F] -> [R, K, N, O]``."""
+        """Evaluate the copies one after the other: ``[R, K, F] -> [R, K, N, O]``."""
         runs, copies = x.shape[1], self.num_copies or 1
         if runs == copies == 1:
             return self.forward_copy(0, x.squeeze(1))
@@ -265,7 +264,7 @@ def select_run(module: ModuleT, run: int) -> ModuleT:
         run: index of the run, in ``0 .. K - 1``.
 
     Returns:
-        A deep copy in which every part with a run axis has lost it.  It shares nothing with ``module``.
+        A deep copy without a run axis, which shares nothing with ``module``.
 
     Raises:
         ValueError: if nothing in ``module`` has a run axis.

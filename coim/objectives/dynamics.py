@@ -1,4 +1,4 @@
-r"""Training of the dynamics ensemble, Eq. 6.
+r"""Loss of the dynamics ensemble, Eq. 6.
 
 Shapes: ``B`` batch, ``K`` runs, ``E`` members, ``S`` state.
 
@@ -25,9 +25,9 @@ from .runs import check_batch, check_by_row, check_num_runs, check_runs_last, sp
 class EnsembleNLLLoss(LossModule):
     """Negative log-likelihood of the transitions under each member of the ensemble, J_p of Eq. 6.
 
-    ``loss_dynamics`` is the mean over the batch and the sum over members (and runs), so that each member gets the
-    gradient it would have had alone.  It is taken on the standardised target of the ensemble: that shifts Eq. 6 by a
-    constant and weighs all entries of the observation alike.
+    ``loss_dynamics`` is the mean over the batch and the sum over members (and runs): each member gets the same gradient
+    as when it is trained alone.  The loss compares standardised targets, which shifts Eq. 6 by a constant and gives all
+    entries of the observation the same weight.
 
     Args:
         ensemble: a :class:`~coim.models.GaussianEnsemble`, or any TensorDict module that writes ``mean`` and
@@ -39,8 +39,8 @@ class EnsembleNLLLoss(LossModule):
             step ahead (``steps_to_next_obs``), or means are not ``[*B, (K,) E, S]``.
 
     Note:
-        All members see the same rows.  Chua et al. [3] draw a bootstrap of the data for each member instead; here
-        members differ by their initial weights alone.
+        All members learn from the same rows, and differ only by their initial weights.  Chua et al. [3] draw a
+        bootstrap of the data for each member.
 
     Example:
         >>> import torch
@@ -57,10 +57,10 @@ class EnsembleNLLLoss(LossModule):
         """Keys that ``set_keys`` changes.
 
         Attributes:
-            observation: state; its successor is read at ``("next", observation)``.
-            mean: written by the ensemble.
-            log_var: written by the ensemble.
-            steps_to_next_obs: how many steps ahead the next observation is; one where it is absent.
+            observation: state; the next one is read at ``("next", observation)``.
+            mean: output of the ensemble.
+            log_var: output of the ensemble.
+            steps_to_next_obs: number of steps to the next observation; 1 if absent.
         """
 
         observation: NestedKey = "observation"
@@ -84,14 +84,14 @@ class EnsembleNLLLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What is read: the inputs of the ensemble and the next observation."""
+        """Keys that the loss reads: the inputs of the ensemble and the next observation."""
         return [*self.ensemble.in_keys, unravel_key(("next", self.tensor_keys.observation))]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """There is no value estimator."""
+        """Do nothing: this loss has no value estimator."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor]) -> EnsembleNLLLoss:
-        """Move to a device or dtype, and the ensemble along: its running statistics stay those of the loss."""
+        """Move the loss and the ensemble to a device or dtype; both keep the same running statistics."""
         with move(fn, (self.ensemble, self.ensemble_params)):
             super()._apply(fn)
         return self
@@ -101,10 +101,10 @@ class EnsembleNLLLoss(LossModule):
         """Compute the loss.
 
         Args:
-            tensordict: ``[*B, (K)]`` rows of Replay_Pop; left as it is.
+            tensordict: ``[*B, (K)]`` rows of Replay_Pop; not changed.
 
         Returns:
-            A TensorDict with the scalar ``loss_dynamics``, with gradient for the ensemble alone.
+            A TensorDict with the scalar ``loss_dynamics``; its gradient goes to the ensemble only.
         """
         tensordict = tensordict.detach()
         check_one_step(tensordict, self.tensor_keys.steps_to_next_obs)
@@ -122,14 +122,14 @@ class EnsembleNLLLoss(LossModule):
 
 
 def check_one_step(rows: TensorDictBase, key: NestedKey) -> None:
-    """Refuse rows of which some next observation is more than one step ahead.
+    """Refuse rows with a next observation that is more than one step ahead.
 
     Args:
         rows: ``[*B]``.
-        key: where the number of steps is; without that entry all are one.
+        key: entry with the number of steps; without it, every row is one step.
 
     Raises:
-        ValueError: naming the greatest number.
+        ValueError: if a row has more than one step; the message has the largest number.
     """
     steps = rows.get(key, None)
     if steps is not None and bool((steps != 1).any()):

@@ -35,12 +35,12 @@ def dynamics_gradients(
     """Loss of Eq. 6, the mean over the batch, and its gradients.
 
     Args:
-        network: layers with SiLU between them; maps ``[(G,) B, F]`` to ``[(G,) B, 2 S]``, mean and log-variance before
-            it is bounded.
-        x: standardised inputs, ``[(G,) B, F]``, in the dtype of the network. All products are taken in it.
-        target: standardised targets, ``[(G,) B, S]``. Losses and the gradient of the network's output are taken in
-            their dtype.
-        log_var_range: the log-variance is softly bounded to it, from above by one softplus, then from below by another.
+        network: layers with SiLU between them; maps ``[(G,) B, F]`` to ``[(G,) B, 2 S]``, the mean and the unbounded
+            log-variance.
+        x: standardised inputs, ``[(G,) B, F]``, in the dtype of the network, which is that of all products.
+        target: standardised targets, ``[(G,) B, S]``. Their dtype is that of the losses and of the gradient of the
+            network's output.
+        log_var_range: soft bounds of the log-variance: one softplus bounds it from above, then another from below.
     """
     activations, preactivations = [x], []
     for weight, bias in zip(network.weights[:-1], network.biases[:-1]):
@@ -55,7 +55,7 @@ def dynamics_gradients(
 
 
 def _output_gradient(out: Tensor, target: Tensor, log_var_range: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Loss, and its gradient with respect to mean and unbounded log-variance."""
+    """The loss and its gradient with respect to the mean and the unbounded log-variance."""
     mean, raw = out.chunk(2, -1)
     low, high = log_var_range
     below = high - softplus(high - raw)

@@ -37,9 +37,9 @@ def bellman_target(reward: Tensor, terminated: Tensor, value: Tensor, gamma: flo
 
     Args:
         reward: ``[*B]``.
-        terminated: bool, ``[*B]``.  Only these rows have no future; a time limit is not one of them.
+        terminated: bool, ``[*B]``.  Only these rows have no future value; a time limit does not set it.
         value: of the next state, ``[*B]``.
-        gamma: discount, in [0, 1]; where the next state is n steps ahead, ``[*B]`` with the n-th power.
+        gamma: discount, in [0, 1].  Where the next state is n steps ahead, its n-th power, ``[*B]``.
 
     Returns:
         ``[*B]``.
@@ -109,11 +109,11 @@ def mixing_weights(
     Args:
         imagined: bool, ``[R, K]``; each run's own rows are in its column.
         mix: ``"batch"`` or ``"sum"``.
-        importance: of each row among those that a mean is taken of, in whatever unit, ``[R, K]``; None: all alike.
+        importance: weight of each row within its mean, in any unit, ``[R, K]``; None weighs all rows alike.
         dtype: of the result, torch's default if None.
 
     Returns:
-        ``[R, K]``.  A kind of row that a run does not have contributes nothing.
+        ``[R, K]``.  A run without rows of one kind gets nothing from that kind.
     """
     if importance is not None:
         importance = importance.to(dtype or torch.get_default_dtype())

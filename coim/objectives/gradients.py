@@ -44,7 +44,7 @@ class Batch(NamedTuple):
 
 
 class SACGradients(NamedTuple):
-    """Gradients of the policy and of each critic: weight, bias, weight, bias, ...; losses and entropy are ``[(K)]``."""
+    """Gradients of the policy and of each critic (weight, bias, weight, bias, ...); losses and entropy, ``[(K)]``."""
 
     policy: list[Tensor]
     critics: list[list[Tensor]]
@@ -63,7 +63,7 @@ def forward(network: Network, x: Tensor) -> list[Tensor]:
 
 
 def deltas(network: Network, activations: Sequence[Tensor], delta: Tensor) -> list[Tensor]:
-    """Gradients of each layer's pre-activation, first layer first, given that of the output."""
+    """Gradients of the pre-activations of all layers, first layer first, from the gradient of the output."""
     found = [delta.to(network.weights[0].dtype)]
     for weight, activation in zip(reversed(network.weights[1:]), reversed(activations[1:-1])):
         found.append(torch.ops.aten.threshold_backward(input_gradient(found[-1], weight), activation, 0.0))
@@ -92,10 +92,10 @@ def sac_gradients(
         critics: N networks, each mapping ``[(K,) B, S + A + D]`` to ``[(K,) B, 1]``.
         targets: the N target critics.
         batch: its weights are those of `coim.objectives.functional.mixing_weights`. Where the networks' weights are
-            bfloat16, products are too; what comes out of a network is brought back to the dtype of the batch.
-        alpha: entropy temperature; a scalar tensor where it may change while what is compiled stays.
+            bfloat16, products are too; the output of a network is cast back to the dtype of the batch.
+        alpha: entropy temperature; a scalar tensor if it changes after compilation.
         gamma: discount, likewise.
-        log_scale_range: the log-scale is clamped to it.
+        log_scale_range: bounds to which the log-scale is clamped.
     """
     size, num_actions = batch.observation.shape[-2], batch.action.shape[-1]
     states = torch.cat([batch.observation, batch.next_observation], -2)
@@ -116,7 +116,7 @@ def sac_gradients(
     critic_activations = [forward(critic, now) for critic in critics]
     stored_q, new_q = torch.cat([a[-1] for a in critic_activations], -1).to(now.dtype).split(size, -2)
 
-    # dJ_Q/dQ at the stored actions, and dJ_pi/dQ at the policy's: the smallest critic takes it, equal ones share it.
+    # dJ_Q/dQ at the stored actions, and dJ_pi/dQ at the policy's: the smallest critic gets it, equal ones share it.
     weight = batch.weight.unsqueeze(-1)
     smallest = (new_q == new_q.amin(-1, keepdim=True)).to(new_q.dtype)
     share = smallest / smallest.sum(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Moving a loss to another device or dtype together with the networks it was made of."""
+"""Move a loss and its networks to another device or dtype together."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 @contextmanager
 def move(fn: Callable[[Tensor], Tensor], *networks: tuple[nn.Module, TensorDictParams]) -> Iterator[None]:
-    """Around ``LossModule._apply``: the networks move first, each by rules of its own, and the loss takes after them.
+    """Wrap ``LossModule._apply``: move the networks before it, each by its own rules, and share their buffers after it.
 
-    TorchRL's loss holds the networks' parameters, and moves these alone: buffers would stay behind in the networks.
+    TorchRL's loss moves only the parameters that it holds. The networks' buffers would stay on the old device.
 
     Args:
-        fn: what ``_apply`` applies.
-        networks: each with what the loss holds of it.
+        fn: the function that ``_apply`` applies.
+        networks: pairs of a network and the parameters of it that the loss holds.
     """
     for network, _ in networks:
         network._apply(fn)

@@ -1,6 +1,6 @@
-"""The run axis in a loss: the mean goes over the rows of a run, the sum over runs.
+"""The run axis in a loss: a mean over the rows of each run, and a sum over runs.
 
-So each run gets exactly the gradient that it would have had alone.
+Each run gets exactly the same gradient as when it is trained alone.
 
 Shapes: ``U`` updates, ``B`` batch, ``K`` runs, ``R`` rows.
 """
@@ -14,14 +14,14 @@ from torch import Tensor, nn
 
 
 def check_num_runs(num_runs: int | None, *networks: nn.Module) -> None:
-    """Refuse a loss whose number of runs is not that of its networks: their gradients would be scaled by 1 / K.
+    """Refuse a loss and networks with different numbers of runs: the gradients would be scaled by 1 / K.
 
     Args:
         num_runs: ``K`` of the loss.
-        networks: those that declare no ``num_runs`` are taken as they are.
+        networks: networks without a ``num_runs`` are not checked.
 
     Raises:
-        ValueError: naming the network.
+        ValueError: if the two differ; the message has the network.
     """
     for network in networks:
         runs = getattr(network, "num_runs", num_runs)
@@ -32,7 +32,7 @@ def check_num_runs(num_runs: int | None, *networks: nn.Module) -> None:
 
 
 def check_batch(batch: Sequence[int], num_runs: int | None) -> None:
-    """Refuse a batch, ``[*B, (K)]``, of which no loss can be taken.
+    """Refuse a batch, ``[*B, (K)]``, that has no rows or no run axis.
 
     Raises:
         ValueError: if the last dimension is not the run axis or there are no rows.
@@ -44,12 +44,12 @@ def check_batch(batch: Sequence[int], num_runs: int | None) -> None:
 
 
 def check_runs_last(rows: TensorDictBase, num_runs: int | None) -> None:
-    """Refuse rows ``[K, T]`` as a rollout returns them, where there are as many steps as runs.
+    """Refuse rows ``[K, T]``, as a rollout returns them, if T equals K.
 
-    The name that TorchRL gives to the dimension of time tells: by their sizes they look like ``[B, K]``.
+    Their shape does not differ from ``[B, K]``. The name that TorchRL gives to the time dimension does.
 
     Raises:
-        ValueError: if time is where the runs must be.
+        ValueError: if the last dimension is time.
     """
     if num_runs is not None and num_runs > 1 and rows.batch_dims and rows.names[-1] == "time":
         raise ValueError(
@@ -59,13 +59,13 @@ def check_runs_last(rows: TensorDictBase, num_runs: int | None) -> None:
 
 
 def check_by_row(what: str, found: Sequence[int], batch: Sequence[int], wanted: str) -> None:
-    """Refuse what a network wrote with another batch than its input: rows would meet the numbers of other rows.
+    """Refuse an output of a network with another batch shape than its input: rows would be paired wrongly.
 
     Args:
-        what: it is, for the sentence.
-        found: its batch.
-        batch: of the input.
-        wanted: shape of the whole.
+        what: name of the output, for the message.
+        found: batch shape of the output.
+        batch: batch shape of the input.
+        wanted: full shape of the output, for the message.
 
     Raises:
         ValueError: if the two differ.
@@ -75,15 +75,15 @@ def check_by_row(what: str, found: Sequence[int], batch: Sequence[int], wanted: 
 
 
 def split_runs(rows: Tensor, num_runs: int | None) -> Tensor:
-    """Bring one number per row, ``[*B, (K)]``, into the shape ``[R, K]``; ``[R, 1]`` without a run axis."""
+    """Reshape one number per row, ``[*B, (K)]``, to ``[R, K]``; ``[R, 1]`` without a run axis."""
     return rows.reshape(-1, num_runs or 1)
 
 
 def by_update(rows: TensorDictBase, num_runs: int | None) -> TensorDictBase:
-    """Bring the batches of a learner into the shape ``[U, B, K]``, with ``K = 1`` where there is no run axis.
+    """Reshape the batches of a learner to ``[U, B, K]``, with ``K = 1`` without a run axis.
 
     Args:
-        rows: ``[B, K]``, one batch, or ``[U, B, K]``, one for each of U updates.  A single run may leave its axis away:
+        rows: ``[B, K]``, one batch, or ``[U, B, K]``, one for each of U updates.  A single run may omit its axis:
             ``[B]``, and with ``num_runs=None`` ``[U, B]``, batches of two rows or more.
         num_runs: ``K`` of the learner, or None.
 

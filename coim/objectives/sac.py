@@ -44,21 +44,21 @@ from .runs import check_batch, check_by_row, check_num_runs, check_runs_last, sp
 
 
 class CriticList(TensorDictModuleBase):
-    """Single critics side by side: their values, each ``[*B, 1]``, joined to ``[*B, N]``.
+    """A list of single critics as one module: it joins their values, each ``[*B, 1]``, to ``[*B, N]``.
 
     Args:
         critics: TensorDict modules that all write ``key``.
-        key: where the values are.
+        key: entry with the values.
 
     Raises:
-        ValueError: if there is none, or one of them is there twice: the two would always say the same.
+        ValueError: if the list is empty, or has one critic twice.
     """
 
     def __init__(self, critics: Sequence[TensorDictModule], *, key: NestedKey = "state_action_value") -> None:
         super().__init__()
         if not critics or len({id(critic) for critic in critics}) < len(critics):
             raise ValueError(
-                f"a list of {len(critics)} critics that are not as many different modules; make one for each entry"
+                f"the list of {len(critics)} critics is empty or has one critic twice; make one module for each entry"
             )
         self.critics = nn.ModuleList(critics)
         self.in_keys = list(dict.fromkeys(k for critic in critics for k in critic.in_keys))
@@ -80,15 +80,14 @@ class CoImSACLoss(LossModule):
     Target critics start equal to the critics and follow them by :class:`torchrl.objectives.SoftUpdate`.
 
     Args:
-        policy: writes an action given what it reads; needs ``get_dist``.
-        qvalue: one module whose values have the critics as their last dimension, ``[*B, (K,) N]``, or a list of
-            single critics.
+        policy: a TensorDict module that writes an action and has ``get_dist``.
+        qvalue: one module that writes the values of all critics, ``[*B, (K,) N]``, or a list of single critics.
         alpha: entropy temperature (Sec. 6.1), fixed.
         gamma: discount.
         mix: ``"batch"`` takes one mean over real and imagined rows (Sec. 5), ``"sum"`` adds the mean over the imagined
             rows to the mean over the real ones (Eq. 7-8 as printed).
         num_runs: ``K``, the last batch dimension; None averages over the whole batch.
-        reduction: ``"mean"`` as above; ``"sum"`` over all rows; ``"none"``: one number for each row, ``[*B, (K)]``.
+        reduction: ``"mean"`` as above; ``"sum"`` over all rows; ``"none"`` for one number per row, ``[*B, (K)]``.
 
     Raises:
         ValueError: if ``mix`` or ``reduction`` is unknown or they do not go together, a number is out of its range,
@@ -96,14 +95,18 @@ class CoImSACLoss(LossModule):
             called: if values are not ``[*B, (K,) N]``, or log-densities not ``[*B, (K)]``.
 
     Note:
-        Optional entries: ``imagined`` (bool, ``[*B, 1]``; absent: all rows are real); ``steps_to_next_obs``
-        (``[*B, 1]``; absent: 1), by which TorchRL's ``MultiStepTransform`` says how far the next state is;
-        ``priority_weight`` (``[*B, 1]``), the importance weights of TorchRL's prioritised replay, for which both losses
-        become weighted means; and, for tests and common random numbers, ``noise`` and ``("next", "noise")``
-        (``[*B, A]``), the :math:`\epsilon_t` of the actor's and of the target's action.
+        Optional entries of a batch:
 
-        For prioritised replay ``td_error`` (``[*B, (K)]``, the largest absolute error of the critics) is written into
-        what the loss is called with, as TorchRL's losses do; nothing else is.
+        - ``imagined``, bool ``[*B, 1]``; without it, all rows are real.
+        - ``steps_to_next_obs``, ``[*B, 1]``, the number of steps to the next state, which TorchRL's
+          ``MultiStepTransform`` writes; without it, 1.
+        - ``priority_weight``, ``[*B, 1]``, the importance weights of TorchRL's prioritised replay: both losses become
+          weighted means.
+        - ``noise`` and ``("next", "noise")``, ``[*B, A]``, the :math:`\epsilon_t` of the actor's and of the target's
+          action, for tests and common random numbers.
+
+        For prioritised replay, the loss writes ``td_error`` into its input, as TorchRL's losses do: ``[*B, (K)]``, the
+        largest absolute error of the critics. It changes nothing else.
 
     Example:
         >>> from coim.models import Policy, PolicyNetwork, QValue, QValueNetwork
@@ -125,15 +128,15 @@ class CoImSACLoss(LossModule):
         """Keys that ``set_keys`` changes; those of the next step are read under ``"next"``.
 
         Attributes:
-            action: stored action, and where the critics read the policy's.
-            design: taken from the current step where ``("next", design)`` is absent.
-            state_action_value: written by the critics.
+            action: stored action; the critics read the policy's action there too.
+            design: taken from the current step if ``("next", design)`` is absent.
+            state_action_value: output of the critics.
             reward: of the next step.
-            terminated: of the next step; the only flag that cuts the bootstrap.
+            terminated: of the next step; the only flag that stops the bootstrap.
             imagined: whether a row was imagined.
-            noise: standard normal of the policy's action.
-            steps_to_next_obs: how many steps ahead the next step is.
-            priority: written, for prioritised replay.
+            noise: standard normal noise of the policy's action.
+            steps_to_next_obs: number of steps to the next state.
+            priority: output for prioritised replay.
             priority_weight: importance weight of a row.
         """
 
@@ -176,7 +179,7 @@ class CoImSACLoss(LossModule):
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose 'mean', 'sum' or 'none'")
         if mix == "sum" and reduction != "mean":
-            raise ValueError(f"mix='sum' adds two means and reduction={reduction!r} takes none; leave one of them away")
+            raise ValueError(f"mix='sum' adds two means, and reduction={reduction!r} takes none; leave one of them out")
         if not 0 <= gamma <= 1:
             raise ValueError(f"gamma={gamma} is outside [0, 1]; Sec. 6.1 has 0.99")
         if not alpha >= 0:
@@ -191,19 +194,19 @@ class CoImSACLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What must be there: the inputs of the networks, action, reward, terminated; the policy's inputs next."""
+        """Keys that a batch must have: action, reward, terminated, and the networks' inputs, now and next."""
         keys = self.tensor_keys
         after = [*self.policy.in_keys, keys.reward, keys.terminated]
         now = [*self.policy.in_keys, *self.qvalue.in_keys, keys.action]
         return list(dict.fromkeys([*now, *(unravel_key(("next", key)) for key in after)]))
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """There is no value estimator; a list of critics writes where they write."""
+        """Rename the output of a list of critics; this loss has no value estimator."""
         if isinstance(self.qvalue, CriticList):
             self.qvalue.out_keys = [self.tensor_keys.state_action_value]
 
     def _apply(self, fn: Callable[[Tensor], Tensor]) -> CoImSACLoss:
-        """Move to a device or dtype; networks and targets come along."""
+        """Move the loss, its networks and its targets to a device or dtype."""
         with move(fn, (self.policy, self.policy_params), (self.qvalue, self.qvalue_params)):
             super()._apply(fn)
         return self
@@ -213,7 +216,7 @@ class CoImSACLoss(LossModule):
         """Compute both losses.
 
         Args:
-            tensordict: ``[*B, (K)]`` transitions; ``td_error`` is written, the rest is left as it is.
+            tensordict: ``[*B, (K)]`` transitions; ``td_error`` is written, nothing else is changed.
 
         Returns:
             ``loss_actor``, ``loss_qvalue`` and, for the log, ``entropy`` (nats): scalars, the entropy a mean over all
@@ -232,8 +235,8 @@ class CoImSACLoss(LossModule):
         )
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """J_Q of Eq. 7, with gradient for the critics alone, and the error of each row, ``[*B, (K)]``."""
-        tensordict = tensordict.detach()  # the graph that made the rows is not the critics'
+        """J_Q of Eq. 7, with a gradient for the critics only, and the error of each row, ``[*B, (K)]``."""
+        tensordict = tensordict.detach()  # no gradient to the networks that made the rows
         target = self._td_target(tensordict)
         with self.qvalue_params.to_module(self.qvalue, preserve_module_state=False):
             q = self._values(tensordict)
@@ -241,7 +244,7 @@ class CoImSACLoss(LossModule):
         return self._reduced(qvalue_loss(q, target), tensordict), td_error
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """J_pi of Eq. 8, with gradient for the policy alone, and the log-densities, ``[*B, (K)]``."""
+        """J_pi of Eq. 8, with a gradient for the policy only, and the log-densities, ``[*B, (K)]``."""
         tensordict = tensordict.detach()
         action, log_prob = self._act(tensordict)
         with self.qvalue_params.data.to_module(self.qvalue, preserve_module_state=False):
@@ -287,7 +290,7 @@ class CoImSACLoss(LossModule):
         return values
 
     def _reduced(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Mean over the batch in the sense of ``mix`` and sum over runs, or what ``reduction`` says instead."""
+        """Reduce one number per row: by ``mix`` over the batch and a sum over runs, or by ``reduction``."""
         importance = tensordict.get(self.tensor_keys.priority_weight, None)
         if importance is not None:
             importance = importance.reshape(rows.shape)
@@ -302,7 +305,7 @@ class CoImSACLoss(LossModule):
 
 
 def reparametrised(dist: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Action and log-density of a policy for given noise, by the arithmetic of TanhNormal.rsample_and_log_prob.
+    """Action and log-density of a policy for given noise, computed as in TanhNormal.rsample_and_log_prob.
 
     Args:
         dist: the policy's distribution.
@@ -315,7 +318,7 @@ def reparametrised(dist: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:
         TypeError: if the distribution is not a TanhNormal.
     """
     if not isinstance(dist, TanhNormal):
-        raise TypeError(f"noise is for TanhNormal policies, not {type(dist).__name__}; leave the key away to sample")
+        raise TypeError(f"noise is for TanhNormal policies, not {type(dist).__name__}; leave the key out to sample")
     preimage = dist.loc + noise * dist.scale
     transform = dist.transforms[0]
     action = transform(preimage)
