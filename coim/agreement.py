@@ -8,7 +8,7 @@ Shapes: K runs, I first designs, N rows that are tried, D design, S observation,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from numbers import Integral
 
@@ -20,7 +20,7 @@ from coim.buffers import Buffers
 from coim.designs import DesignGenerator, DesignSearch
 from coim.envs.morph import MorphEnv
 from coim.envs.simulator_dream import SimulatorDynamics
-from coim.envs.world_model import WorldModelEnv
+from coim.envs.world_model import AnchoredDynamics, WorldModelEnv
 from coim.learners.dynamics import DynamicsLearner
 from coim.learners.sac import SACLearner
 from coim.learners.written_out import check_exchangeable
@@ -41,6 +41,14 @@ def check_counts(counts: Mapping[str, int], updates: Mapping[str, int]) -> None:
     for name, count in updates.items():
         if count < 0:
             raise ValueError(f"{name} is {count}, it must be at least 0 (0 does not train)")
+
+
+def check_words(**options: tuple[str, Sequence[str]]) -> None:
+    """Refuse a word that an option, by its name, does not know."""
+    for name, (word, known) in options.items():
+        if word not in known:
+            choices = ", ".join(repr(one) for one in known[:-1]) + f" or {known[-1]!r}"
+            raise ValueError(f"{name}={word!r} is unknown; choose {choices}")
 
 
 def check_kinds(parts: Mapping[str, tuple[object, type]]) -> None:
@@ -232,6 +240,25 @@ def check_dream(
     _check_rewards(env, dream)
     _check_model(env, model)
     _check_generator(env, generator, first_designs)
+
+
+def check_imagined(
+    env: MorphEnv, dream: WorldModelEnv | None, *, imagined_states: str, value_states: str, anchored: bool
+) -> None:
+    """Refuse to match states of bodies that cannot tell how high they stand, and to anchor with a model that cannot.
+
+    Raises:
+        ValueError: of `coim.envs.kinematics`, if the bodies' lengths are not known as functions of their designs.
+        TypeError: if the model has no ``means``.
+    """
+    if "matched" in (imagined_states, value_states):
+        observation, unit = env.observation_spec["observation"].zero(), torch.ones_like(env.design_spec.space.low)
+        env.transfer(observation, unit, unit)
+    if anchored and dream is not None and not isinstance(dream.ensemble, AnchoredDynamics):
+        raise TypeError(
+            f"a {type(dream.ensemble).__name__} has no means() to anchor with; give it one as AnchoredDynamics has it, "
+            "or leave anchored out"
+        )
 
 
 def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 
@@ -133,3 +134,35 @@ def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -
             f"{rows[1]} + {rows[0]} rows; enlarge the batch, or set a share to 0"
         )
     return BatchParts(own=own, other=rows[1], imagined=rows[0])
+
+
+def put_imagined(
+    batches: TensorDictBase,
+    imagined: TensorDictReplayBuffer,
+    num_rows: Tensor,
+    *,
+    rng: torch.Generator | None = None,
+) -> TensorDictBase:
+    """Put imagined rows in the place of the first rows of each batch, as many as each run may have.
+
+    `sample_mixture` gives all runs the same share. Here a run with no imagined rows keeps its batch to the last bit,
+    and nothing is drawn where no run has any.
+
+    Args:
+        batches: ``[num_batches, B, K]`` rows with ``imagined``, as of `sample_mixture`; left as they are.
+        imagined: Replay_Art.
+        num_rows: of each run, ``[K]``, at most B.
+        rng: as for :func:`sample_batches`.
+
+    Returns:
+        ``[num_batches, B, K]`` rows.
+    """
+    most = int(num_rows.max())
+    if most == 0:
+        return batches
+    drawn = sample_batches(imagined, batch_size=most, num_batches=len(batches), rng=rng)
+    drawn.set("imagined", torch.ones_like(drawn["next", "terminated"]))
+    place = torch.arange(most, device=drawn["design"].device)
+    mask = place[:, None] < num_rows.to(place.device)  # [most, K]
+    mixed = drawn.where(mask.expand(drawn.batch_size), batches[:, :most])
+    return torch.cat([mixed, batches[:, most:]], 1)

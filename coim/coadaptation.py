@@ -29,11 +29,13 @@ from coim.agreement import (
     check_counts,
     check_dream,
     check_first_designs,
+    check_imagined,
     check_kinds,
     check_learners,
     check_networks,
     check_precision,
     check_search,
+    check_words,
 )
 from coim.batches import BatchParts, batch_parts, sample_mixture
 from coim.buffers import Buffers
@@ -44,10 +46,13 @@ from coim.envs.morph import MorphEnv
 from coim.envs.world_model import WorldModelEnv
 from coim.episode import run_episode
 from coim.events import DesignChosen, DesignDone, EpisodeDone, Event, Kind
-from coim.imagination import imagine
+from coim.governor import Governor
+from coim.imagination import Actions
+from coim.imagined_replay import ImaginedReplay
 from coim.learners.divergence import Divergence
 from coim.learners.dynamics import DynamicsLearner
 from coim.learners.sac import SACLearner
+from coim.pairs import StatesAre
 
 UPDATES_PER_SAMPLE = 50  # batches drawn in one call: the replay's fixed cost is paid once for all of them
 
@@ -93,7 +98,18 @@ class CoAdaptation:
         individual_mix: share of an individual batch drawn from Replay_Pop ("primarily", Sec. 4; 0 in Algorithm 1).
         individual_imagined_share: share of an individual batch drawn from Replay_Art. Algorithm 1 cites Eq. 7-8 for the
             individual networks too, Sec. 5 gives imagined rows to the population alone; 0 follows Sec. 5.
+        imagined_states: what the states of imagined rows are under another design: ``"stored"`` (the paper's) or
+            ``"matched"``, see `coim.imagine`.
+        imagined_actions: ``"fresh"`` ones of pi_Pop (the paper's), or those ``"replayed"`` with the states.
+        anchored: whether imagined rows start from real transitions, see `coim.imagine`.
+        governed: whether ``imagined_share`` is the most of a batch that may be imagined, and how much is depends on
+            what is measured of the model, run by run (see `coim.governor`). A run that never earns any is the
+            model-free baseline, to the last bit.
         num_start_states: n, start states that Eq. 5 averages over.
+        value_states: what the states of Eq. 5 are under the query: ``"stored"`` (the paper's) or ``"matched"``, see
+            `coim.DesignValue`.
+        value_over: states that Eq. 5 averages over: those that episodes ``"start"`` with (the paper's), or those that
+            were ``"visited"`` so far, a draw of Replay_Pop.
         side_by_side: train the individual learner in one thread while another trains the population's and the ensemble.
             They do not depend on each other, and the result is the same to the last bit. For learners on the CPU.
         precision: of the networks' products in Eq. 5; each learner has its own.
@@ -102,12 +118,12 @@ class CoAdaptation:
 
     Raises:
         ValueError: if a count is no whole number or below its least value, a share outside [0, 1] or of less than a
-            row, ``bodies`` or ``precision`` is unknown, or the parts do not agree (see `coim.agreement`): two
-            environments or learners are one, evaluation is of another body or task, networks lack the runs of the
-            bodies or have other sizes, the two learners' networks or their scalings differ, buffers are too small or
-            for other runs, the dream steps another ensemble than the one that learns or pays other rewards, G or the
-            search leaves the bounds, first designs have the wrong shape, dtype or device, or learners that are not on
-            the CPU shall go side by side.
+            row, a word such as ``bodies`` is unknown, nothing is learnt that could be governed, or the parts do not
+            agree (see `coim.agreement`): two environments or learners are one, evaluation is of another body or task,
+            networks lack the runs of the bodies or have other sizes, the two learners' networks or their scalings
+            differ, buffers are too small or for other runs, the dream steps another ensemble than the one that learns
+            or pays other rewards, G or the search leaves the bounds, first designs have the wrong shape, dtype or
+            device, or learners that are not on the CPU shall go side by side.
         TypeError: if an environment or the dream is behind transforms, or a part is no such thing at all.
         RuntimeError: if networks were moved after their learner was made.
 
@@ -143,13 +159,24 @@ class CoAdaptation:
         imagined_share: float = 0.2,
         individual_mix: float = 0.0,
         individual_imagined_share: float = 0.0,
+        imagined_states: StatesAre = "stored",
+        imagined_actions: Actions = "fresh",
+        anchored: bool = False,
+        governed: bool = False,
         num_start_states: int = 36,
+        value_states: StatesAre = "stored",
+        value_over: Literal["start", "visited"] = "start",
         side_by_side: bool = False,
         precision: Literal["float32", "bfloat16"] = "float32",
         seed: int = 0,
     ) -> None:
-        if bodies not in ("search", "random", "fixed"):
-            raise ValueError(f"bodies={bodies!r} is unknown; choose 'search', 'random' or 'fixed'")
+        check_words(
+            bodies=(bodies, ("search", "random", "fixed")),
+            imagined_states=(imagined_states, ("stored", "matched")),
+            imagined_actions=(imagined_actions, ("fresh", "replayed")),
+            value_states=(value_states, ("stored", "matched")),
+            value_over=(value_over, ("start", "visited")),
+        )
         counts = {
             "num_designs": num_designs,
             "first_episodes": first_episodes,
@@ -174,6 +201,7 @@ class CoAdaptation:
         self.device = check_learners(env, population, individual, dynamics, side_by_side=side_by_side)
         check_networks(env, population, individual, dynamics)
         check_dream(env, dynamics, dream, generator, first_designs)
+        check_imagined(env, dream, imagined_states=imagined_states, value_states=value_states, anchored=anchored)
         self.env, self.evaluation_env = env, evaluation_env
         self.population, self.individual, self.dynamics = population, individual, dynamics
         self.divergence = Divergence(
@@ -181,6 +209,19 @@ class CoAdaptation:
         )
         self.buffers, self.search, self.first_designs, self.bodies = buffers, search, first_designs, bodies
         self.dream, self.generator = dream, generator
+        self.governor = _governor(dynamics, dream) if governed else None
+        self.imagined = None
+        if dream is not None and generator is not None:
+            self.imagined = ImaginedReplay(
+                buffers.art,
+                dream,
+                generator,
+                states_are=imagined_states,
+                anchored=anchored,
+                actions=imagined_actions,
+                governor=self.governor,
+            )
+        self.value_states, self.value_over = value_states, value_over
         self.num_designs, self.first_episodes, self.episodes = num_designs, first_episodes, episodes
         self.individual_updates, self.population_updates, self.model_updates = updates.values()
         imagines = generator is not None
@@ -244,6 +285,8 @@ class CoAdaptation:
         cpu = torch.device("cpu")
         devices: dict[str, torch.device] = {"actions": cpu, "dream": self.device, "designs": cpu}
         devices |= dict.fromkeys(("individual", "population", "model"), replay)
+        if self.governor is not None:  # last, so that the numbers of all others stay what they are without it
+            devices |= dict.fromkeys(("imagined states", "imagined population", "imagined individual"), replay)
         return {
             name: torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=seeds, device="cpu")))
             for name, device in devices.items()
@@ -263,8 +306,7 @@ class CoAdaptation:
                 self.buffers.pop.extend(rows)
             # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
             with booked(seconds, "imagine"):
-                metrics = self._observe(rows)
-                self._refresh_imagined()
+                metrics = self._observe(rows, episode) | self._refresh_imagined()
             self.buffers.s0.extend(rows[:1])
             self.divergence.remember()
             metrics |= self._learn(seconds)
@@ -289,21 +331,28 @@ class CoAdaptation:
             diverged=dict(self.divergence.places),
         )
 
-    def _observe(self, rows: TensorDictBase) -> Means:
+    def _observe(self, rows: TensorDictBase, episode: int) -> Means:
         """Scale the ensemble by the new rows, and say how well it foresaw them before it learns from them."""
         if self.dynamics is None:
             return {}
         self.dynamics.observe(rows)
-        return {"model_error": self.dynamics.error(rows).cpu()}
+        error = self.dynamics.error(rows).cpu()
+        if self.governor is not None:
+            self.governor.observe(error, first=episode == 0)
+        return {"model_error": error}
 
-    def _refresh_imagined(self) -> None:
-        """Empty Replay_Art and fill it with states of Replay_Pop, designs of G, and actions of pi_Pop."""
-        self.buffers.art.empty()
-        if self.dream is None or self.generator is None or len(self.buffers.pop) == 0:
-            return
-        states = self.buffers.pop.sample(self.imagined_rows).to(self.device)
-        rows = imagine(self.dream, states, self.population.policy, self.generator, rng=self.rngs["dream"])
-        self.buffers.art.extend(rows)
+    def _refresh_imagined(self) -> Means:
+        """Fill Replay_Art anew, if anything is imagined; see `coim.imagined_replay`."""
+        if self.imagined is None:
+            self.buffers.art.empty()
+            return {}
+        rng, states_rng = self.rngs["dream"], self.rngs.get("imagined states")
+        metrics = self.imagined.refresh(
+            self.buffers.pop, self.population.policy, self.imagined_rows, rng=rng, states_rng=states_rng
+        )
+        if self.governor is not None:
+            metrics["imagined_share"] = self.governor.shares(self.population_parts.imagined / self.batch_size)
+        return metrics
 
     def _rows_to_draw(self) -> int:
         """Imagined rows that the updates after one episode will draw, and at least one."""
@@ -342,7 +391,13 @@ class CoAdaptation:
     ) -> Means:
         """Draw batches by their parts and learn from them; returns the mean of each metric, ``[K]``."""
         own = self.buffers.ind if name == "individual" else self.buffers.pop
-        sources = ((own, parts.own), (self.buffers.pop, parts.other), (self.buffers.art, parts.imagined))
+        # Governed, a batch is drawn as the model-free baseline draws it, and imagined rows are put into it afterwards.
+        governed = parts.imagined if self.governor is not None else 0
+        sources = (
+            (own, parts.own + governed),
+            (self.buffers.pop, parts.other),
+            (self.buffers.art, parts.imagined - governed),
+        )
         means: Means = {}
         with booked(seconds, f"train {name}"):
             for done in range(0, updates, UPDATES_PER_SAMPLE):
@@ -350,9 +405,21 @@ class CoAdaptation:
                     raise RuntimeError("an update failed or was interrupted; go on from a state_dict of before")
                 count = min(UPDATES_PER_SAMPLE, updates - done)
                 batches = sample_mixture(sources, count, imagined=self.buffers.art, rng=self.rngs[name])
+                if governed and self.imagined is not None:
+                    rng = self.rngs[f"imagined {name}"]
+                    batches = self.imagined.put_into(batches, governed / self.batch_size, rng=rng)
                 for key, value in learner.update(batches).items():
                     means[f"{name}/{key}"] = means.get(f"{name}/{key}", 0.0) + value.cpu() * (count / updates)
         return means
+
+
+def _governor(dynamics: DynamicsLearner | None, dream: WorldModelEnv | None) -> Governor:
+    """A governor of the model that is learnt."""
+    if dynamics is None or dream is None:
+        raise ValueError(
+            "what is imagined is governed by the errors of the model that is learnt; give dynamics and dream"
+        )
+    return Governor(dynamics.ensemble)
 
 
 def episode_return(rows: TensorDictBase) -> Tensor:

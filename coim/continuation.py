@@ -53,6 +53,7 @@ def state_of(algorithm: CoAdaptation) -> dict[str, Any]:
         "population": algorithm.population.state_dict(),
         "individual": algorithm.individual.state_dict(),
         "dynamics": None if algorithm.dynamics is None else algorithm.dynamics.state_dict(),
+        "imagined": None if algorithm.imagined is None else algorithm.imagined.state_dict(),
         "dream": None if algorithm.dream is None else algorithm.dream.rng.get_state(),
         "search": _if_any(algorithm.search, "state_dict"),
         "buffers": algorithm.buffers.state_dict(),
@@ -73,6 +74,10 @@ def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
     for part in ("dynamics", "dream"):
         if (state[part] is None) != (getattr(algorithm, part) is None):
             raise ValueError(f"one of the state and the algorithm has a {part} and the other has none; make it alike")
+    # Runs that were begun before impossible pairs were counted go on with the columns that their tables have.
+    imagined = state.get("imagined") or {"counts": False, "governor": None}
+    if (imagined["governor"] is None) != (algorithm.governor is None):
+        raise ValueError("one of the state and the algorithm is governed and the other is not; make it alike")
     algorithm.buffers.check_state(state["buffers"])
     algorithm.population.load_state_dict(state["population"])
     algorithm.individual.load_state_dict(state["individual"])
@@ -80,6 +85,8 @@ def restore(algorithm: CoAdaptation, state: Mapping[str, Any]) -> None:
         algorithm.dynamics.load_state_dict(state["dynamics"])
     if algorithm.dream is not None:
         restore_generator(algorithm.dream.rng, state["dream"])
+    if algorithm.imagined is not None:
+        algorithm.imagined.load_state_dict(imagined)
     for name in ("env", "evaluation_env"):
         env = getattr(algorithm, name)
         env.set_simulation_state(TensorDict(state[name], state[name]["design"].shape[:1]))

@@ -8,6 +8,7 @@ References:
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -62,14 +63,22 @@ def _next_design(algorithm: CoAdaptation) -> tuple[Kind, Tensor, Tensor | None]:
 
 
 def _fitness(algorithm: CoAdaptation) -> list[Fitness]:
-    """Eq. 5 of each run, over the same draw of start states; a run that has diverged has none to climb."""
-    states = algorithm.buffers.s0.sample(algorithm.num_start_states).to(algorithm.device)
-    policy, qvalue, precision = algorithm.population.policy, algorithm.population.qvalue, algorithm.precision
+    """Eq. 5 of each run, over the same draw of states; a run that has diverged has none to climb."""
+    buffers = algorithm.buffers
+    source = buffers.s0 if algorithm.value_over == "start" else buffers.pop
+    states = source.sample(algorithm.num_start_states).to(algorithm.device)
+    policy, qvalue = algorithm.population.policy, algorithm.population.qvalue
+    value = functools.partial(
+        DesignValue,
+        precision=algorithm.precision,
+        start_states_are=algorithm.value_states,
+        env=algorithm.env,
+    )
     runs = algorithm.env.batch_size.numel()
     if policy.num_runs is None:
-        return [DesignValue(policy, qvalue, states[:, 0], precision=precision)]
+        return [value(policy, qvalue, states[:, 0])]
     return [
-        DesignValue(select_run(policy, k), select_run(qvalue, k), states[:, k], precision=precision)
+        value(select_run(policy, k), select_run(qvalue, k), states[:, k])
         if k not in algorithm.divergence.places
         else flat_fitness
         for k in range(runs)

@@ -50,6 +50,7 @@ def small(
         qvalue = make_qvalue(env, num_cells=(8,), num_runs=stacked).to(device)
         return SACLearner(policy, qvalue, num_runs=stacked, seed=seed)
 
+    population, individual = learner(1), learner(2)  # before the ensemble: the same weights with and without one
     imagination: dict[str, Any] = {}
     if imagine:
         ensemble = GaussianEnsemble.for_env(env, num_cells=(8,), num_runs=stacked).to(device)
@@ -73,8 +74,8 @@ def small(
     return CoAdaptation(
         env,
         evaluation_env,
-        population=learner(1),
-        individual=learner(2),
+        population=population,
+        individual=individual,
         buffers=Buffers.for_env(env, **capacities, seed=0, device=replay or device),
         search=ParticleSwarm(env.design_spec, num_particles=5, num_iterations=2, seed=0),
         **imagination | defaults | settings,

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from test_coadaptation import STEPS, small
 
-from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation
+from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation, imagined_replay
 from coim import design_choice as design_loop
 from coim.batches import batch_parts
 
@@ -41,7 +41,7 @@ def traced(algorithm: CoAdaptation, monkeypatch: pytest.MonkeyPatch) -> list[str
     spy(coadaptation, "run_episode", episode)
     spy(coadaptation, "sample_mixture", mixture)
     spy(
-        coadaptation,
+        imagined_replay,
         "imagine",
         lambda dream, states, policy, *a, **k: f"imagine {len(states)} with pi_{whose[id(policy)]}",
     )

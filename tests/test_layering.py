@@ -20,6 +20,7 @@ RANKS = {name: 0 for name in ("objectives.functional", "products", "angles", "ra
 RANKS |= {name: 1 for name in ("envs", "models", "objectives", "designs", "buffers", "batches", "compiling", "pairs")}
 RANKS |= {name: 2 for name in ("learners", "episode", "imagination", "events", "agreement", "design_choice")}
 RANKS |= {name: 2 for name in ("continuation", "coadaptation", "checkpoints", "saved_run", "run_folder")}
+RANKS |= {name: 2 for name in ("governor", "imagined_replay")}
 RANKS |= {"experiments": 3}
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
 HOMES |= {name: "experiments" for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray")}

@@ -259,6 +259,20 @@ class GaussianEnsemble(TensorDictModuleBase):
         members = self._draw_members(first.shape[:-1], first.device, generator)
         return tuple(self.sample(*one, members=members, noise=torch.zeros_like(one[0])) for one in asked)
 
+    def disagreement(self, observation: Tensor, action: Tensor, design: Tensor) -> Tensor:
+        """How far the members' means lie apart, in variances of the target, averaged over entries: ``[*B, (K)]``.
+
+        Args:
+            observation: ``[*B, (K,) S]``.
+            action: ``[*B, (K,) A]``.
+            design: ``[*B, (K,) D]``.
+        """
+        means, _ = self._predict(observation, action, design)
+        if self.predict == "next":  # two angles beside the cut at pi are near; of changes none is that large
+            std = self.targets.std.to(means.dtype).unsqueeze(-2)
+            means = self.wrapped((means - means[..., :1, :]) * std) / std
+        return means.var(-2, correction=0).mean(-1)
+
     def _draw_members(self, batch: torch.Size, device: torch.device, generator: torch.Generator | None) -> Tensor:
         """Draw a member for each transition, uniformly."""
         source = device if generator is None else generator.device

@@ -22,8 +22,8 @@ from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import CIRCLE, put_legend
 from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.model_error.design_space import FILE, LAYOUT
-from coim.experiments.model_error.placed_simulator import IN_THE_FLOOR
 from coim.experiments.model_error.tables import FOLDER, Kind, Row, folders_with, name_of
+from coim.pairs import IN_THE_FLOOR
 from coim.tables import read_cells
 
 SOURCES = {"delta": "model of changes", "next": "model of next states", "simulator": "simulator"}

@@ -11,10 +11,7 @@ import torch
 from torch import Tensor
 
 from coim.envs import MorphEnv
-
-# m. Contacts are soft: under random actions half of all states are 3 mm deep, 99 % less than 21 mm (hopper, cheetah) or
-# 41 mm (walker), and a hard fall reaches 44 to 88 mm.
-IN_THE_FLOOR = 0.05
+from coim.pairs import IN_THE_FLOOR
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ from coim.experiments.model_error.design_space import (
     within,
 )
 from coim.experiments.model_error.errors import mean_squares, persistence_error, prediction_error
-from coim.experiments.model_error.placed_simulator import IN_THE_FLOOR, PlacedSimulator
+from coim.experiments.model_error.placed_simulator import PlacedSimulator
 from coim.experiments.model_error.run import probe, write_design_space
 from coim.experiments.model_error.test_rows import NEVER_BUILT, Probes, joined
+from coim.pairs import IN_THE_FLOOR
 
 BOUNDS = HopperMorph.DESIGN_BOUNDS
 
