@@ -7,6 +7,7 @@ too, on paper without colours.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -15,14 +16,17 @@ BLACK, GREY, LIGHT = "#000000", "#999999", "#E0E0E0"
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 
 KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s"), "fixed": (ORANGE, "D")}
-DASHES = ("-", "--", ":")
-CHARACTERS = 120  # of a legend, side by side on a page
+Dashes = (
+    str | tuple[float, tuple[float, ...]]
+)  # matplotlib's line style; a tuple is an offset, then line and gap lengths
+DASHES: tuple[Dashes, ...] = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (6, 1, 1, 1)))
+CHARACTERS = 120  # that fit side by side in a legend over the page's width
 CIRCLE = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "magenta", "markeredgewidth": 2}  # as Fig. 4
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
 
-def style_of(index: int, count: int) -> dict[str, str]:
-    """Colour and dashes of one of several things that are compared; black where there is nothing to compare with."""
+def style_of(index: int, count: int) -> dict[str, Any]:
+    """Matplotlib's keywords for lines of one of several things that are compared; black for a single one."""
     if count == 1:
         return {"color": BLACK, "linestyle": "-"}
     return {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index // len(COLOURS) % len(DASHES)]}

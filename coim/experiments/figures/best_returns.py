@@ -13,35 +13,41 @@ from matplotlib.lines import Line2D
 
 from coim.experiments.drawing.palette import GREY, put_legend
 from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.figures.legend import line_entries
 from coim.experiments.statistics.intervals import RESAMPLES, Statistic, iqm, mean, over_runs
-from coim.experiments.study import arms as styles
+from coim.experiments.study.arms import ARMS, FAMILIES, arm_named, in_order
 from coim.experiments.study.runs import Place, Run, Runs, read_runs
 
-FIGURES = {
-    "figure_1_best_returns": ("none", "known"),
-    "figure_3_best_returns": ("none", "known", "noisy", "random"),
+PAPER = {
+    "figure_1_best_returns": ["none", "known"],
+    "figure_3_best_returns": ["none", "known", "noisy", "random"],
 }
 STATISTICS: dict[str, Statistic] = {"mean": mean, "IQM": iqm}
 PANEL = (3.6, 2.3)  # inches
 CAPTION = (
     "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
     "over the evaluation episodes on it. After the first designs, which are given, those that maximise Q and random "
-    "ones take turns{exceptions}. Faint: single runs. Strong: mean and interquartile mean (IQM) of those that have "
-    f"reached the design. Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} resamples, within "
-    "environment, task and arm). "
+    "ones take turns, unless the arm says otherwise. Faint: single runs. Strong: mean and interquartile mean (IQM) of "
+    f"those that have reached the design. Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} "
+    "resamples, within environment, task and arm). "
 )
-EXCEPTIONS = {"random-bodies": "takes random ones only", "control-only": "has one body all the time"}
 
 
 def plots(study: Path) -> Iterator[Plot]:
-    """Fig. 1, Fig. 3, and all arms together where there are others."""
+    """Fig. 1, Fig. 3, and a figure of each family of arms that has others."""
     runs = read_runs(study)
-    figures = dict(FIGURES)
-    others = [arm for arm in runs.arms if not any(arm in arms for arms in FIGURES.values())]
-    if others:
-        figures["best_returns_all_arms"] = tuple(runs.arms)
-    for name, arms in figures.items():
+    for name, arms in (PAPER | families(runs.arms)).items():
         yield draw(name, runs, [arm for arm in arms if arm in runs.arms])
+
+
+def families(there: Sequence[str]) -> dict[str, list[str]]:
+    """Arms of each figure beside the paper's: a family whose arms the paper does not have all, with its baselines."""
+    figures = {}
+    for family in FAMILIES:
+        own = [name for name in there if ARMS[name].family == family]
+        if {*own} - {arm for arms in PAPER.values() for arm in arms}:
+            figures[f"best_returns_{family}"] = in_order([*own, *(b for name in own for b in ARMS[name].baselines)])
+    return figures
 
 
 def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
@@ -67,7 +73,7 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
     for axes in lowest.values():
         axes.tick_params(labelbottom=True)
         axes.set(xlabel="design (number)")
-    entries = styles.handles(drawn)
+    entries = line_entries(drawn)
     if any(run.diverged for run in runs.found if run.arm in drawn):
         entries.append(Line2D([], [], marker="x", color=GREY, linestyle="", label="diverged after this design"))
     put_legend(figure, entries)
@@ -76,8 +82,7 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
 
 def caption_of(arms: Sequence[str]) -> str:
     """What is seen of these arms."""
-    told = ", ".join(f"{arm} {words}" for arm, words in EXCEPTIONS.items() if arm in arms)
-    return CAPTION.format(exceptions=f" ({told})" if told else "")
+    return f"{CAPTION}Arms: {'; '.join(f'{arm} {arm_named(arm).words}' for arm in arms)}. "
 
 
 def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:
@@ -104,10 +109,10 @@ def draw_panel(
         values = best_returns(own, longest, failure)
         value, low, high, count = over_runs(values, STATISTICS[label])
         x, shown = np.arange(1, longest + 1), count > 0
-        axes.plot(x, value, linewidth=1.6, zorder=3, marker="o" if shown.sum() == 1 else "", **styles.style(arm))
-        axes.fill_between(x, low, high, color=styles.style(arm)["color"], alpha=0.1, linewidth=0, zorder=2)
+        axes.plot(x, value, linewidth=1.6, zorder=3, marker="o" if shown.sum() == 1 else "", **arm_named(arm).line)
+        axes.fill_between(x, low, high, color=arm_named(arm).colour, alpha=0.1, linewidth=0, zorder=2)
         for end in (low, high):
-            axes.plot(x, end, linewidth=0.5, zorder=2, **styles.style(arm))
+            axes.plot(x, end, linewidth=0.5, zorder=2, **arm_named(arm).line)
         head: dict[str, object] = {"environment": environment, "task": task, "arm": arm, "series": label}
         for i in np.flatnonzero(shown):
             numbers = {"best_return": value[i], "low": low[i], "high": high[i], "runs": int(count[i])}
@@ -143,7 +148,7 @@ def draw_run(axes: Axes, run: Run) -> None:
     if not run.designs:
         return
     x, y = zip(*sorted((row["design"], row["best_return"]) for row in run.designs))
-    colour = styles.style(run.arm)["color"]
+    colour = arm_named(run.arm).colour
     axes.plot(x, y, color=colour, linewidth=0.6, alpha=0.25, zorder=1)
     if run.diverged:
         axes.plot(x[-1:], y[-1:], color=colour, marker="x", linestyle="", zorder=4)

@@ -14,7 +14,7 @@ from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.run.records import number
 from coim.experiments.statistics import retrained as retrained_pairs
 from coim.experiments.statistics.retrained import Cells, Line, by_place, results, sizes
-from coim.experiments.study import arms as styles
+from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import CHOSEN, Runs, read_runs
 from coim.tables import read_cells
 
@@ -143,13 +143,13 @@ def draw(rows: Sequence[Cells], words: str) -> Plot:
 def draw_panel(axes: Axes, values: dict[str, np.ndarray]) -> None:
     """Boxes and points of each arm."""
     for x, (arm, returns) in enumerate(values.items()):
-        colour = styles.style(arm)["color"]
+        colour = arm_named(arm).colour
         axes.boxplot(
             returns, positions=[x], widths=0.5, whis=(0, 100), patch_artist=True,
             boxprops={"facecolor": colour, "alpha": 0.25, "edgecolor": colour},
             medianprops={"color": colour, "linewidth": 1.6}, whiskerprops={"color": colour}, capprops={"color": colour},
         )  # fmt: skip
         spread = x + np.linspace(-0.18, 0.18, len(returns) + 2)[1:-1]
-        axes.scatter(spread, returns, s=14, color=colour, marker=styles.MARKERS.get(arm, "o"), zorder=3)
+        axes.scatter(spread, returns, s=14, zorder=3, **arm_named(arm).point)
     axes.set(xticks=range(len(values)), xticklabels=[f"{arm}\nn = {len(v)}" for arm, v in values.items()])
     axes.spines[["top", "right"]].set_visible(False)

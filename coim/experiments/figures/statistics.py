@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import BLACK, GREY, put_legend
 from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.figures.legend import point_entries
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, interval, iqm, mean
 from coim.experiments.statistics.measures import MEASURES, Cells, Measured, comparisons, limits, measure, predictions
-from coim.experiments.study import arms as styles
+from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
 LABELS = {"area": "area: mean best return\nof a design (1)", "final": "final: highest\nbest return (1)"}
@@ -89,11 +89,11 @@ def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequenc
     """One measure of every arm of one environment and task."""
     for x, arm in enumerate(runs.arms_at(place)):
         here = [m for m in measured if (m.run.environment, m.run.task) == place and m.run.arm == arm and m.run.over]
-        values, colour = np.array([getattr(m, name) for m in here]), styles.style(arm)["color"]
+        values, colour = np.array([getattr(m, name) for m in here]), arm_named(arm).colour
         if not here:
             continue
         spread = x + np.linspace(-0.22, 0.22, len(here) + 2)[1:-1]
-        axes.scatter(spread, values, s=12, color=colour, marker=styles.MARKERS.get(arm, "o"), alpha=0.6, linewidth=0)
+        axes.scatter(spread, values, s=12, alpha=0.6, linewidth=0, **arm_named(arm).point)
         low, high = interval(iqm, values)
         axes.vlines(x, low, high, color=colour, linewidth=2.5)
         axes.hlines(iqm(values), x - 0.3, x + 0.3, color=colour, linewidth=2.5)
@@ -103,14 +103,20 @@ def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequenc
 
 
 def name_arms(axes: Axes, arms: Sequence[str]) -> None:
-    """Names below the columns; slanted where there is no room for them side by side."""
-    slanted = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if room_for_names(arms) else {}
-    axes.set_xticks(range(len(arms)), arms, **slanted)
+    """Names below the columns: side by side, slanted or upright, as there is room for them."""
+    turned = {"rotation": angle, "ha": "right", "rotation_mode": "anchor"} if (angle := angle_of_names(arms)) else {}
+    axes.set_xticks(range(len(arms)), arms, **({"va": "center"} if angle == 90 else {}) | turned)
+
+
+def angle_of_names(arms: Sequence[str]) -> int:
+    """Degrees by which the names of so many arms are turned."""
+    return 0 if len(arms) <= 4 else 30 if len(arms) <= 7 else 90
 
 
 def room_for_names(arms: Sequence[str]) -> float:
-    """Inches that slanted names take from a panel; none where they stand side by side."""
-    return 0.5 * (len(arms) > 4)
+    """Inches that turned names take from the height of a panel; none where they stand side by side."""
+    longest = max(map(len, arms), default=0) * 0.07  # inches of a letter
+    return longest * math.sin(math.radians(angle_of_names(arms)))
 
 
 def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
@@ -122,9 +128,9 @@ def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
     for axes, name in zip(grid, MEASURES):
         own = [row for row in rows if row["measure"] == name]
         for y, row in enumerate(reversed(own)):
-            paint = {"color": styles.style(str(row["arm"]))["color"]}
-            axes.plot([row["improvement_low"], row["improvement_high"]], [y, y], linewidth=2, **paint)
-            axes.plot(row["improvement"], y, marker=styles.MARKERS.get(str(row["arm"]), "o"), **paint)
+            arm = arm_named(str(row["arm"]))
+            axes.plot([row["improvement_low"], row["improvement_high"]], [y, y], linewidth=2, color=arm.colour)
+            axes.plot(row["improvement"], y, **arm.point)
         labels = ["{arm} over {against}\n{environment}, {task}".format(**row) for row in reversed(own)]
         axes.axvline(0.5, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
         axes.set(xlim=(-0.03, 1.03), ylim=(-0.7, len(own) - 0.3), xlabel="probability of improvement (1)")
@@ -162,15 +168,14 @@ def predicted(runs: Runs) -> Plot:
                 for row in predictions(run)
             ]
             x, y = ([row[key] for row in own] for key in PREDICTED[-2:])
-            paint = {"color": styles.style(arm)["color"], "marker": styles.MARKERS.get(arm, "o")}
-            axes.scatter(x, y, s=12, alpha=0.6, linewidth=0, **paint)
+            axes.scatter(x, y, s=12, alpha=0.6, linewidth=0, **arm_named(arm).point)
             rows += own
         axes.axline((0, 0), slope=1, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
         axes.set(xlabel=r"$(1 - \gamma)\ Q(\xi)$, reward per step (1)", ylabel="best return / steps (1)")
         axes.set(title=", ".join(place))
     for axes in grid[len(places) :]:
         axes.remove()
-    put_legend(figure, points({str(row["arm"]) for row in rows}))
+    put_legend(figure, point_entries({str(row["arm"]) for row in rows}))
     caption = (
         "Eq. 5 before anything was learnt on a body, against the best return on it, a point for each design. "
         "(1 - gamma) Q and return / steps are both a reward per step and equal (dashed) if the reward is constant; Q "
@@ -213,8 +218,7 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
         for x, arm in enumerate(runs.arms_at(place)):
             values = [getattr(m, name) for m in here if m.run.arm == arm]
             spread = x + np.linspace(-0.25, 0.25, len(values) + 2)[1:-1]
-            paint = {"color": styles.style(arm)["color"], "marker": styles.MARKERS.get(arm, "o")}
-            axes.scatter(spread, values, s=14, alpha=0.7, linewidth=0, **paint)
+            axes.scatter(spread, values, s=14, alpha=0.7, linewidth=0, **arm_named(arm).point)
         name_arms(axes, runs.arms_at(place))
         axes.set(ylabel=labels[name], title=", ".join(place))
         axes.set_ylim(0, 1.1 * max(getattr(m, name) for m in here))
@@ -224,11 +228,3 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
         f"their updates and evaluation. {runs.in_words(runs.arms)}"
     )
     return Plot(name="statistics_runs", figure=figure, rows=rows, caption=caption)
-
-
-def points(names: set[str]) -> list[Line2D]:
-    """Entries of a legend: marks."""
-    return [
-        Line2D([], [], color=styles.style(arm)["color"], marker=styles.MARKERS.get(arm, "o"), linestyle="", label=arm)
-        for arm in styles.in_order(names)
-    ]

@@ -34,8 +34,7 @@ from coim.experiments.drawing.palette import GREY
 from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, SEED, holm
 from coim.experiments.statistics.measures import welch
-from coim.experiments.study import arms as styles
-from coim.experiments.study.arms import pairs_of_arms
+from coim.experiments.study.arms import arm_named, in_order, pairs_of_arms
 from coim.experiments.study.runs import Place, Run, runs_of_folder
 
 Line = dict[str, str]
@@ -51,9 +50,7 @@ def by_place(rows: Sequence[Cells]) -> dict[Place, dict[str, list[Cells]]]:
     for row in rows:
         found.setdefault((str(row["environment"]), str(row["task"])), []).append(row)
     return {
-        place: {
-            arm: [row for row in own if row["arm"] == arm] for arm in styles.in_order(str(row["arm"]) for row in own)
-        }
+        place: {arm: [row for row in own if row["arm"] == arm] for arm in in_order(str(row["arm"]) for row in own)}
         for place, own in found.items()
     }
 
@@ -148,9 +145,9 @@ def draw(table: Sequence[Cells]) -> Plot:
 def draw_panel(axes: Axes, rows: Sequence[Cells]) -> None:
     """One environment and task; the first pair on top."""
     for y, row in enumerate(reversed(rows)):
-        paint = {"color": styles.style(str(row["arm"]))["color"]}
-        axes.plot([row["difference_low"], row["difference_high"]], [y, y], linewidth=2, **paint)
-        axes.plot(row["difference"], y, marker=styles.MARKERS.get(str(row["arm"]), "o"), **paint)
+        arm = arm_named(str(row["arm"]))
+        axes.plot([row["difference_low"], row["difference_high"]], [y, y], linewidth=2, color=arm.colour)
+        axes.plot(row["difference"], y, **arm.point)
     axes.axvline(0, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
     labels = ["{arm} minus {against}".format(**row) for row in reversed(rows)]
     axes.set(ylim=(-0.7, len(rows) - 0.3), yticks=range(len(rows)), yticklabels=labels)

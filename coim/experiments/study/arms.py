@@ -1,73 +1,198 @@
-"""Order, names and colours of a study's arms: the same in every figure."""
+"""Arms of a study: what each computes, what it is compared with, and how figures show it.
+
+An arm is one entry of `ARMS`. Study definitions, statistics and figures read everything from it, so a new arm is a new
+entry here and nothing else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
+from matplotlib.colors import is_color_like
 from matplotlib.lines import Line2D
 
-from coim.experiments.drawing.palette import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
+from coim.experiments.drawing.palette import BLACK, BLUE, DASHES, GREEN, GREY, ORANGE, PURPLE, VERMILION, Dashes
 
-# What is compared. All arms of a seed share the first designs, the initial weights and the reset noise.
-ARMS: dict[str, dict[str, Any]] = {
-    "none": {"designs": "none"},  # the model-free baseline
-    "known": {"designs": "known"},
-    "noisy": {"designs": "noisy"},
-    "random": {"designs": "random"},
-    # No co-adaptation, and no search in it: both against "none".
-    "control-only": {"designs": "none", "bodies": "fixed"},
-    "random-bodies": {"designs": "none", "bodies": "random"},
-    # Against "random": the same impossible pairs of state and body, without the error of a model.
-    "oracle": {"designs": "random", "dream": "simulator"},
-}
-
-# Against whom: everybody against the baseline; what imagines unseen bodies against what imagines seen ones; the
-# simulator that imagines random bodies against the model that does.
-BASELINES = {"none": None, "known": ("noisy", "random"), "random": ("oracle",)}
-
-# The paper's colours as far as this palette has them: none blue, known red, noisy yellow, random black.
-STYLES = {
-    "none": {"color": BLUE, "linestyle": "-"},
-    "known": {"color": VERMILION, "linestyle": "--"},
-    "noisy": {"color": ORANGE, "linestyle": "-."},
-    "random": {"color": BLACK, "linestyle": ":"},
-    "control-only": {"color": GREY, "linestyle": "--"},
-    "random-bodies": {"color": GREEN, "linestyle": "-."},
-    "oracle": {"color": PURPLE, "linestyle": "-"},
-}
-MARKERS = {
-    "none": "o",
-    "known": "^",
-    "noisy": "s",
-    "random": "D",
-    "control-only": "v",
-    "random-bodies": "P",
-    "oracle": "*",
+Family = Literal["imagination", "bodies"]
+FAMILIES: dict[Family, str] = {
+    "imagination": "arms that differ in what they imagine",
+    "bodies": "arms that differ in how they choose the next body",
 }
 
 
-def in_order(arms: Iterable[str]) -> list[str]:
-    """Arms as figures list them; those that are not known here come last, by name."""
-    known = list(STYLES)
-    return sorted(set(arms), key=lambda arm: (known.index(arm) if arm in STYLES else len(known), arm))
+@dataclass(frozen=True, kw_only=True)
+class Arm:
+    """One arm of a study.
+
+    Args:
+        name: its name in study files, folders and figures: lower-case letters, digits and hyphens.
+        words: what it does, as the end of a sentence that begins with its name.
+        settings: settings of its runs that differ from the study's protocol.
+        baselines: names of the arms that it is compared with.
+        family: arms of one family and their baselines share a figure of best returns.
+        colour: no other arm of the family has it, so a family has at most eight arms.
+        marker: matplotlib's; no other arm has it in this colour.
+
+    Raises:
+        ValueError: if the name, the colour or the marker cannot be used.
+
+    Example:
+        >>> ARMS["noisy"].settings, ARMS["noisy"].baselines
+        ({'designs': 'noisy'}, ('none', 'known'))
+    """
+
+    name: str
+    words: str
+    settings: Mapping[str, Any]
+    baselines: tuple[str, ...]
+    family: Family
+    colour: str
+    marker: str
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", self.name):
+            raise ValueError(f"arm {self.name!r} must be named by lower-case words with hyphens, such as random-bodies")
+        if not is_color_like(self.colour):
+            raise ValueError(f"colour of arm {self.name} is {self.colour!r}, no colour; take one of drawing/palette.py")
+        if self.marker not in Line2D.markers or self.marker in ("", " ", "none", "None"):
+            raise ValueError(f"marker of arm {self.name} is {self.marker!r}; take one of matplotlib's, such as 'o'")
+
+    @property
+    def dashes(self) -> Dashes:
+        """Line style: solid without a baseline, else by the place among the arms of the family that have one."""
+        if not self.baselines:
+            return DASHES[0]
+        family = [arm.name for arm in ARMS.values() if arm.family == self.family and arm.baselines]
+        return DASHES[1:][family.index(self.name) % len(DASHES[1:])]
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """Matplotlib's keywords for its lines."""
+        return {"color": self.colour, "linestyle": self.dashes}
+
+    @property
+    def point(self) -> dict[str, Any]:
+        """Matplotlib's keywords for its points."""
+        return {"color": self.colour, "marker": self.marker}
 
 
-def style(arm: str) -> dict[str, str]:
-    """Colour and dashes of an arm."""
-    return STYLES.get(arm, {"color": GREY, "linestyle": "-"})
+def by_name(*arms: Arm) -> dict[str, Arm]:
+    """Arms by their names, in the order of figures and tables.
+
+    Raises:
+        ValueError: if two arms cannot be told apart, or a baseline is no arm.
+    """
+    found = {arm.name: arm for arm in arms}
+    if len(found) < len(arms):
+        raise ValueError(f"of {', '.join(arm.name for arm in arms)} two have the same name; rename one")
+    for arm in arms:
+        if unknown := [name for name in arm.baselines if name not in found or name == arm.name]:
+            raise ValueError(f"baselines of arm {arm.name} are no other arms: {', '.join(unknown)}; add them first")
+    looks: dict[tuple[str, str], str] = {}
+    for arm in arms:
+        own = [(arm.family, arm.colour), (arm.marker, arm.colour)]
+        own += [(other.family, arm.colour) for other in arms if arm.name in other.baselines]  # the figure has it too
+        for look in own:
+            if looks.setdefault(look, arm.name) != arm.name:
+                raise ValueError(f"arms {looks[look]} and {arm.name} look alike ({' '.join(look)}); change one of them")
+    return found
 
 
-def handles(arms: Iterable[str]) -> list[Line2D]:
-    """Entries of a legend: lines."""
-    return [Line2D([], [], label=arm, **style(arm)) for arm in in_order(arms)]
+# All arms of a seed share the first designs, the initial weights and the reset noise.
+# The paper's colours as far as the palette has them: none blue, known red, noisy yellow, random black.
+ARMS = by_name(
+    Arm(
+        name="none",
+        words="imagines nothing: the model-free baseline",
+        settings={"designs": "none"},
+        baselines=(),
+        family="imagination",
+        colour=BLUE,
+        marker="o",
+    ),
+    Arm(
+        name="known",
+        words="imagines the designs tried so far",
+        settings={"designs": "known"},
+        baselines=("none",),
+        family="imagination",
+        colour=VERMILION,
+        marker="^",
+    ),
+    Arm(
+        name="noisy",
+        words="imagines the designs tried so far with noise added",
+        settings={"designs": "noisy"},
+        baselines=("none", "known"),  # unseen designs against seen ones
+        family="imagination",
+        colour=ORANGE,
+        marker="s",
+    ),
+    Arm(
+        name="random",
+        words="imagines uniformly random designs",
+        settings={"designs": "random"},
+        baselines=("none", "known"),
+        family="imagination",
+        colour=BLACK,
+        marker="D",
+    ),
+    Arm(
+        name="oracle",
+        words="imagines uniformly random designs, with the simulator in place of the model",
+        settings={"designs": "random", "dream": "simulator"},
+        baselines=("none", "random"),  # the same impossible pairs of state and body, without the error of a model
+        family="imagination",
+        colour=PURPLE,
+        marker="*",
+    ),
+    Arm(
+        name="control-only",
+        words="imagines nothing and keeps one body",
+        settings={"designs": "none", "bodies": "fixed"},
+        baselines=("none",),
+        family="bodies",
+        colour=GREY,
+        marker="v",
+    ),
+    Arm(
+        name="random-bodies",
+        words="imagines nothing and builds random bodies only",
+        settings={"designs": "none", "bodies": "random"},
+        baselines=("none",),
+        family="bodies",
+        colour=GREEN,
+        marker="P",
+    ),
+)
 
 
-def pairs_of_arms(arms: Sequence[str]) -> list[tuple[str, str]]:
-    """Who is compared with whom, by `BASELINES`."""
+def arm_named(name: str) -> Arm:
+    """The arm of this name.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if name not in ARMS:
+        raise ValueError(f"arm {name!r} is none of {', '.join(ARMS)}; add it to ARMS in {__name__}")
+    return ARMS[name]
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Each of these arms once, in the order of `ARMS`.
+
+    Raises:
+        ValueError: if one of them is no arm.
+    """
+    order = list(ARMS)
+    return sorted({arm_named(name).name for name in names}, key=order.index)
+
+
+def pairs_of_arms(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Pairs of an arm and one of its baselines, as far as both are among these names."""
     return [
-        (arm, against)
-        for against, whom in BASELINES.items()
-        for arm in arms
-        if against in arms and arm != against and (whom is None or arm in whom)
+        (name, baseline) for baseline in ARMS if baseline in names for name in names if baseline in ARMS[name].baselines
     ]

@@ -56,7 +56,7 @@ class Block:
     environments: tuple[str, ...]
     """Of half_cheetah, hopper, walker."""
     arms: tuple[str, ...]
-    """What is compared: none, known, noisy, random, control-only, random-bodies, oracle."""
+    """Names of arms, as `coim.experiments.study.arms.ARMS` has them."""
     seeds: tuple[int, ...]
     """Shared by all arms, which makes every comparison one of pairs."""
     tasks: tuple[str, ...] = ("forward",)
@@ -149,7 +149,7 @@ class Study(Block):
             for environment, task, arm in itertools.product(block.environments, block.tasks, block.arms):
                 settings = dataclasses.replace(
                     PROTOCOLS[self.protocol],
-                    **overrides | ARMS[arm],
+                    **overrides | ARMS[arm].settings,
                     task=task,
                     seed=seeds[0],
                     num_runs=len(seeds),

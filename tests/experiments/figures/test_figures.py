@@ -113,14 +113,19 @@ def test_figures_repeat_to_the_last_bit(study: Path) -> None:
     assert first == {path.name: path.read_bytes() for path in (study / "figures").iterdir()}
 
 
-def test_other_arms_have_a_figure_with_all_of_them(study: Path) -> None:
+def test_other_arms_have_a_figure_with_their_family_and_its_baselines(study: Path) -> None:
     write_cell(study, "hopper-forward-oracle-0", [1, 2, 3, 4])
+    write_cell(study, "hopper-forward-control-only-0", [1, 2, 3, 4])
     write_figures(study)
     arms = {
         name: {row["arm"] for row in read_table(study / "figures" / f"{name}.csv")}
-        for name in ("figure_1_best_returns", "best_returns_all_arms")
+        for name in ("figure_1_best_returns", "best_returns_imagination", "best_returns_bodies")
     }
-    assert arms == {"figure_1_best_returns": {"none", "known"}, "best_returns_all_arms": {"none", "known", "oracle"}}
+    assert arms == {
+        "figure_1_best_returns": {"none", "known"},
+        "best_returns_imagination": {"none", "known", "oracle"},
+        "best_returns_bodies": {"none", "control-only"},
+    }
 
 
 def test_several_environments_and_tasks_stand_in_one_figure(study: Path) -> None:
@@ -223,7 +228,7 @@ def test_the_caption_tells_what_other_arms_do_and_places_of_other_arms_have_no_p
     figure = figures["figure_1_best_returns"].figure
     assert figure is not None
     assert "walker" not in " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
-    assert "(control-only has one body all the time)" in figures["best_returns_all_arms"].caption
+    assert "control-only imagines nothing and keeps one body" in figures["best_returns_bodies"].caption
     assert "control-only" not in figures["figure_1_best_returns"].caption
 
 
