@@ -1,7 +1,7 @@
-"""Where designs come from: the generators G of the imagination, and the searches for the next body.
+"""Generators G of imagined designs, and searches for the next body.
 
-A generator is a callable ``(design, *, rng=None) -> design`` (:class:`DesignGenerator`), a search an object with
-``maximise(fitness) -> (design, value)`` (:class:`DesignSearch`); one class with one method adds another of either.
+A generator is a callable ``(design, *, rng=None) -> design`` (:class:`DesignGenerator`). A search is an object with
+``maximise(fitness) -> (design, value)`` (:class:`DesignSearch`). A class with that one method adds another of either.
 """
 
 from __future__ import annotations

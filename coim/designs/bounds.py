@@ -1,4 +1,4 @@
-"""The box of all designs, as generators and searches read it from a spec.
+"""Read the bounds of a design from a spec, for generators and searches.
 
 Shapes: ``*B`` any batch, ``D`` design entries.
 """
@@ -10,17 +10,17 @@ from torchrl.data import Bounded
 
 
 def bounds_of(spec: Bounded) -> tuple[Tensor, Tensor]:
-    """Return lowest and highest design, each ``[D]``, of a spec."""
+    """Return the lowest and the highest design of a spec, each ``[D]``."""
     if not hasattr(spec.space, "low") or len(spec.shape) != 1:
         raise ValueError(f"{spec} is not the bounds of one design; pass env.design_spec, a Bounded of shape [D]")
     return spec.space.low, spec.space.high
 
 
 def bounds_for(design: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the bounds on ``design``'s device and in its dtype, or say that its length is wrong."""
+    """Return the bounds on the device and in the dtype of ``design``; refuse a design of another length."""
     if design.shape[-1:] != low.shape:
         raise ValueError(
-            f"a design of shape {list(design.shape)} has not the {len(low)} entries of the design space; "
+            f"a design of shape {list(design.shape)} does not have the {len(low)} entries of the design space; "
             f"pass [*B, {len(low)}]"
         )
     return low.to(design), high.to(design)

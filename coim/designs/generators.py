@@ -1,4 +1,4 @@
-"""Generators G of the designs that the imagination works with.
+"""Generators G: the designs of imagined rows.
 
 Shapes: ``*B`` any batch, ``D`` design entries.
 
@@ -18,14 +18,14 @@ from .bounds import bounds_for, bounds_of
 
 
 class DesignGenerator(Protocol):
-    """What :func:`coim.imagine` asks for the designs of imagined rows: G of Eq. 7-8."""
+    """A generator G of Eq. 7-8: :func:`coim.imagine` gets the designs of imagined rows from it."""
 
     def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
-        """Give each row the design ``[*B, D]`` that it is imagined with, from the ``[*B, D]`` that it was seen with."""
+        """Return the designs ``[*B, D]`` to imagine, given the designs ``[*B, D]`` of the stored rows."""
 
 
 class KnownDesigns:
-    """G(xi) = xi: every row keeps the design that it was seen with (Sec. 6.3).
+    """G(xi) = xi: every row keeps its stored design (Sec. 6.3).
 
     Example:
         >>> KnownDesigns()(torch.tensor([[1.0, 1.5]]))
@@ -40,7 +40,7 @@ class KnownDesigns:
 class NoisyDesigns:
     """G(xi) = N(xi, sigma^2), clipped to the bounds (Sec. 6.4).
 
-    The paper leaves open what becomes of a draw outside of the bounds: it is clipped, entry by entry.
+    The paper does not say what happens to a draw outside of the bounds. Here each entry is clipped.
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``.
@@ -57,7 +57,7 @@ class NoisyDesigns:
 
     def __init__(self, spec: Bounded, *, sigma: float = 0.1) -> None:
         if not sigma >= 0.0:
-            raise ValueError(f"sigma is {sigma}, a standard deviation is 0 or more; KnownDesigns() adds no noise")
+            raise ValueError(f"sigma is {sigma}, but a standard deviation is 0 or more; KnownDesigns() adds no noise")
         self._low, self._high = bounds_of(spec)
         self.sigma = sigma
 
@@ -69,9 +69,9 @@ class NoisyDesigns:
 
 
 class RandomDesigns:
-    """G(xi) = uniform(Xi): every row gets a fresh design from the whole design space (Sec. 6.4).
+    """G(xi) = uniform(Xi): every row gets a new design from the whole design space (Sec. 6.4).
 
-    Also the exploration step of Algorithm 1.
+    It is also the exploration step of Algorithm 1.
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``.

@@ -1,6 +1,6 @@
-"""Search for the next body by climbing the gradient of its fitness.
+"""Search for the next body by gradient ascent on its fitness.
 
-Shapes: ``D`` design entries, ``P`` starts that climb side by side.
+Shapes: ``D`` design entries, ``P`` starts that climb in parallel.
 
 References:
     Co-Imagination of Behaviour and Morphology of Agents: Eq. 5 (what is maximised).
@@ -21,23 +21,23 @@ from .search import Fitness, evaluate
 
 
 class GradientSearch:
-    """Projected gradient ascent with Adam from many starts at once; not in the paper, which has a swarm.
+    """Projected gradient ascent with Adam from many starts at once; the paper has a swarm instead.
 
-    The critics and the policy are differentiable in the design, so that one step uphill tells more than a swarm's
-    guesses.  The starts are uniform over the design space; entries that leave it go back to its edge after each step.
-    The step falls linearly to zero.
+    The critics and the policy are differentiable in the design, so one gradient step uses more information than the
+    random moves of a swarm.  The starts are uniform over the design space.  After each step, entries outside of it are
+    clipped to its edge.  The step size falls linearly to zero.
 
-    The defaults are measured on trained networks of Half-Cheetah and Hopper: within 0.01 % of the swarm's value in a
-    fifteenth of its time.
+    On trained networks of Half-Cheetah and Hopper, the defaults get within 0.01 % of the swarm's value in a fifteenth
+    of its time.
 
-    The search has random numbers of its own, which go on from one call to the next.
+    The search has its own random numbers, which continue from call to call.
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``; its device and dtype are the candidates'.
-        num_starts: ``P``, designs that climb.
-        num_steps: times that each is evaluated and moved; the last move is not looked at.
+        num_starts: ``P``, designs to start from.
+        num_steps: evaluations and moves of each; the last move is not evaluated.
         lr: length of the first step, as a share of the range of each entry.
-        seed: of the search's own random numbers; None takes fresh entropy.
+        seed: seed of the search's random numbers; None takes a random one.
 
     Raises:
         ValueError: if ``spec`` is not one bounded design, a number of starts or steps is below 1, or ``lr`` is not
@@ -56,7 +56,7 @@ class GradientSearch:
         if min(num_starts, num_steps) < 1:
             raise ValueError(f"{num_starts} starts x {num_steps} steps: both must be at least 1")
         if not lr > 0:
-            raise ValueError(f"lr is {lr}, it must be positive: it is the first step as a share of the design's range")
+            raise ValueError(f"lr is {lr}, it must be positive: the first step, as a share of the design's range")
         self.spec = spec
         self._low, self._high = bounds_of(spec)
         self.num_starts, self.num_steps, self.lr = num_starts, num_steps, lr
@@ -67,11 +67,11 @@ class GradientSearch:
             self._rng.manual_seed(seed)
 
     def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:
-        """Climb to the design of highest fitness.
+        """Find the design of highest fitness.
 
         Args:
-            fitness: maps candidates ``[P, D]``, always inside the bounds, to values ``[P]`` that are differentiable in
-                the candidates; each value may depend on its own design only.
+            fitness: maps candidates ``[P, D]``, always inside the bounds, to values ``[P]``. It is differentiable, and
+                each value depends on its own design only.
 
         Returns:
             The best design seen, ``[D]``, and its value.
@@ -100,16 +100,16 @@ class GradientSearch:
         return best, best_value
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the state of the search's random numbers; nothing else lives from one call to the next."""
+        """Return the state of the search's random numbers; it has no other state."""
         return {"rng": self._rng.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
-        """Go on with the random numbers of :meth:`state_dict`."""
+        """Restore the random numbers from :meth:`state_dict`."""
         restore_generator(self._rng, state_dict["rng"])
 
 
 def _with_gradient(fitness: Fitness, designs: Tensor) -> tuple[Tensor, Tensor]:
-    """Values ``[P]`` of designs ``[P, D]`` and the gradient of each in its own design, ``[P, D]``."""
+    """Return the values ``[P]`` of designs ``[P, D]``, and the gradient of each value in its design, ``[P, D]``."""
     with torch.enable_grad():
         designs = designs.detach().requires_grad_()
         values = evaluate(fitness, designs)

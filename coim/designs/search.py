@@ -1,4 +1,4 @@
-"""What a search for the next body is, and what it asks of the fitness that it maximises.
+"""The protocol of a search for the next body, and the checks on the fitness that it maximises.
 
 Shapes: ``D`` design entries, ``P`` candidate designs tried at once.
 
@@ -17,12 +17,12 @@ Fitness = Callable[[Tensor], Tensor]
 
 
 class DesignSearch(Protocol):
-    """What finds the next body: an optimiser of a fitness such as :class:`coim.DesignValue`.
+    """A search for the next body: it maximises a fitness such as :class:`coim.DesignValue`.
 
-    One that has its bounds as ``spec`` is refused at once where they do not fit the bodies.
+    If it has its bounds as ``spec``, `coim.CoAdaptation` refuses bounds that do not fit the bodies.
 
-    One whose random numbers go on from call to call also needs ``state_dict`` and ``load_state_dict``: without them a
-    run that is resumed draws others than the run that was never stopped.
+    If its random numbers continue from call to call, it also needs ``state_dict`` and ``load_state_dict``. Without
+    them, a resumed run draws other numbers than an uninterrupted one.
     """
 
     def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:
@@ -30,7 +30,7 @@ class DesignSearch(Protocol):
 
 
 def evaluate(fitness: Fitness, designs: Tensor) -> Tensor:
-    """Call a fitness and check what it returns, ``[P, D] -> [P]``.
+    """Call a fitness and check its result, ``[P, D] -> [P]``.
 
     Raises:
         ValueError: if it returns another shape, or a value that is not finite.

@@ -1,4 +1,4 @@
-"""Search for the next body by a swarm of particles.
+"""Search for the next body by particle swarm optimisation.
 
 Shapes: ``*B`` any batch, ``D`` design entries, ``P`` particles (candidate designs tried at once).
 
@@ -28,9 +28,9 @@ from .search import Fitness, evaluate
 
 @contextmanager
 def _no_reports() -> Iterator[None]:
-    """Keep pyswarms' reporters from configuring logging, which would also open ``report.log`` in the working directory.
+    """Stop pyswarms from configuring the logging, which would also create ``report.log`` in the working directory.
 
-    Every one of its modules and handlers makes a reporter, at import and at construction.
+    All of its modules and handlers make a reporter that does so, at import or when they are made.
     """
     with mock.patch.object(logging.config, "dictConfig"):
         yield
@@ -45,33 +45,34 @@ with _no_reports():
 
 
 class ParticleSwarm:
-    """Particle swarm with a global best, by pyswarms' operators (Sec. 4, "Design Optimisation").
+    """Particle swarm optimisation with a global best, made of pyswarms' operators (Sec. 4, "Design Optimisation").
 
-    All particles are evaluated in one call, ``[P, D] -> [P]``. The paper does not give the settings; these are its
-    baseline's (ksluck/Coadaptation), but for the bounds. There a particle that leaves the design space on one side
-    comes in again on the other (``bounds="periodic"``), and such a swarm does not settle on an edge: of six entries
-    whose sum is maximised it gets 11.3 to 11.5 of 12, and ``"nearest"`` gets 12.
+    All particles are evaluated in one call, ``[P, D] -> [P]``. The paper does not give the settings. These are those of
+    its baseline (ksluck/Coadaptation), except for the bounds. In the baseline, a particle that leaves the design space
+    on one side enters it again on the other (``bounds="periodic"``). Such a swarm does not converge to an edge: when it
+    maximises the sum of six entries, it reaches 11.3 to 11.5 of 12, and ``"nearest"`` reaches 12.
 
-    The swarm has random numbers of its own, which go on from one call to the next. numpy's global state, the logging
-    configuration and the working directory, all of which pyswarms touches, are as before after each call.
+    The swarm has its own random numbers, which continue from call to call. pyswarms changes numpy's global state and
+    the logging configuration, and writes to the working directory; after each call, all three are as before.
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``; its device and dtype are the candidates'.
         num_particles: candidate designs per iteration.
         num_iterations: moves of the swarm.
-        c1: pull towards the best place that the particle itself has seen.
-        c2: pull towards the best place that any particle has seen.
+        c1: attraction to the best position of the particle itself.
+        c2: attraction to the best position of all particles.
         w: inertia, the share of its velocity that a particle keeps.
-        bounds: where a particle goes that has left the design space: to the nearest edge, or in on the other side.
-        seed: of the swarm's own random numbers; None takes fresh entropy.
+        bounds: what happens to a particle outside of the design space: ``"nearest"`` clips it to the edge,
+            ``"periodic"`` lets it enter on the other side.
+        seed: seed of the swarm's random numbers; None takes a random one.
 
     Raises:
         ValueError: if ``spec`` is not one bounded design, a number of particles or iterations is below 1, or ``bounds``
             is an unknown option.
 
     Note:
-        numpy's global state is exchanged while the swarm moves, so another thread that draws from it meanwhile draws
-        from the swarm's numbers. During ``fitness`` the global state is the caller's.
+        The swarm replaces numpy's global state while it moves. Another thread that draws from it at that time gets
+        the swarm's numbers. During ``fitness``, the global state is the caller's.
 
     Example:
         >>> search = ParticleSwarm(Bounded(low=0.8, high=2.0, shape=(2,)), num_particles=50, num_iterations=60, seed=0)
@@ -102,11 +103,11 @@ class ParticleSwarm:
         self.num_particles = num_particles
         self.num_iterations = num_iterations
         self.options = {"c1": c1, "c2": c2, "w": w}
-        # pyswarms draws from numpy's global generator, whose state is of this legacy kind.
+        # pyswarms draws from numpy's global generator, and this is the legacy format of its state.
         self._random_state: Any = np.random.RandomState(seed).get_state()
 
     def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:
-        """Search the design of highest fitness.
+        """Find the design of highest fitness.
 
         Args:
             fitness: maps candidates ``[P, D]``, always inside the bounds, to values ``[P]``; called without gradients.
@@ -135,22 +136,22 @@ class ParticleSwarm:
         return self._candidates(swarm.best_pos), -float(swarm.best_cost)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the swarm's random numbers; nothing else lives from one call to the next."""
+        """Return the state of the swarm's random numbers; it has no other state."""
         _, key, position, *_ = self._random_state
         return {"key": torch.from_numpy(key.astype(np.int64)), "position": int(position)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on with the random numbers of :meth:`state_dict`."""
-        # Only uniform numbers are drawn, so there is never half of a normal pair to keep.
+        """Restore the random numbers from :meth:`state_dict`."""
+        # The last two entries hold a normal number kept for the next draw; only uniform numbers are drawn here.
         self._random_state = ("MT19937", state_dict["key"].numpy().astype(np.uint32), state_dict["position"], 0, 0.0)
 
     def _candidates(self, position: np.ndarray) -> Tensor:
-        """Turn pyswarms' float64 places into designs, ``[*B, D]``, inside the bounds exactly."""
+        """Convert pyswarms' float64 positions to designs, ``[*B, D]``, exactly inside the bounds."""
         return torch.as_tensor(position, dtype=self._low.dtype, device=self._low.device).clamp(self._low, self._high)
 
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
-        """Exchange numpy's global state for the swarm's, and back."""
+        """Replace numpy's global state by the swarm's, and restore it at the end."""
         outside = np.random.get_state()  # noqa: NPY002
         np.random.set_state(self._random_state)  # noqa: NPY002
         try:

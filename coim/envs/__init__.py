@@ -1,4 +1,4 @@
-"""Robots whose bodies are set by a design, as TorchRL environments."""
+"""Robots with bodies that a design sets, as TorchRL environments."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from coim.lazy import lazy_names
 try:
     import mujoco  # noqa: F401
 except ModuleNotFoundError:
-    pass  # the dream does without; the bodies, when they are asked for, say that it is missing
-except AttributeError as error:  # PyOpenGL's way to say that the library which MUJOCO_GL names is not installed
+    pass  # the dream does not need mujoco; importing a body says that it is missing
+except AttributeError as error:  # what PyOpenGL raises if the library of MUJOCO_GL is not installed
     raise ImportError(
         f"MUJOCO_GL={os.environ.get('MUJOCO_GL')} names an OpenGL library that is missing: unset MUJOCO_GL, or install "
         "the library (Debian: apt-get install libegl1 libegl-mesa0 for egl, libosmesa6 for osmesa)"

@@ -1,4 +1,4 @@
-"""The bodies of this library by the names of their recipes, which stand in a run's ``config.json``."""
+"""The bodies of this library by name, as in the ``config.json`` of a run."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Pictures of a body, without a screen.
 
-The bodies compile fast because they have no textures. A picture needs them, or nobody sees the ground pass by: sky and
-chequered floor are added to a copy here, which costs nothing beside drawing. Without a graphics card the first picture
-takes about a fifth of a second, most of it to set up OpenGL, and each one at 640 x 480 about 30 ms.
+The bodies have no textures, so that they compile fast. A picture needs textures to show the motion over the ground: a
+copy of the body gets a sky and a chequered floor, in negligible time. Without a graphics card the first picture takes
+about 0.2 s, mostly to set up OpenGL, and each one of 640 x 480 pixels about 30 ms.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Self
 import mujoco
 import numpy as np
 
-PERIOD = 2.0  # m, of the chequered floor: two squares of 1 m, which MuJoCo draws with texrepeat 1 (tried out)
+PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJoCo draws with texrepeat 1 (measured)
 SHADOWS = (
-    1024  # texels of a side of the shadow map; MuJoCo's 4096 take more than half of a picture without a graphics card
+    1024  # texels along a side of the shadow map; MuJoCo's 4096 take more than half of the time without a graphics card
 )
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
@@ -24,15 +24,15 @@ MISSING_GL = (
 
 
 class Camera:
-    """Draws one body from its right side, moving along with it; close it, or use it in a ``with`` block.
+    """A camera that follows one body on its right side; close it, or use it in a ``with`` block.
 
     Args:
-        spec: the body; it is left as it is.
+        spec: the body; it is not changed.
         width: pixels.
         height: pixels.
 
     Raises:
-        RuntimeError: there is no OpenGL to draw with; the sentence says what to install and set.
+        RuntimeError: if there is no OpenGL to draw with; the message says what to install and set.
     """
 
     def __init__(self, spec: mujoco.MjSpec, *, width: int, height: int) -> None:
@@ -52,20 +52,20 @@ class Camera:
         """Draw the body in a pose.
 
         Args:
-            qpos: joint positions, ``[nq]``, the first being the distance travelled in m.
+            qpos: joint positions, ``[nq]``; the first one is the distance travelled in m.
 
         Returns:
             The picture, ``[height, width, 3]`` uint8.
         """
         self._data.qpos[:] = qpos
-        # The floor looks the same there, and who runs far leaves neither it nor the light.
+        # Draw the body within one period of the floor: it looks the same, and stays on the floor and in the light.
         self._data.qpos[0] = self._view.lookat[0] = qpos[0] % PERIOD
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._view)
         return self._renderer.render()
 
     def close(self) -> None:
-        """Free what the pictures were drawn with."""
+        """Free the resources of OpenGL."""
         self._renderer.close()
 
     def __enter__(self) -> Self:
@@ -76,7 +76,7 @@ class Camera:
 
 
 def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
-    """A copy with a sky, a chequered floor (1 m squares) and room for the picture in the off-screen buffer."""
+    """Return a copy with a sky, a floor of 1 m squares, and an off-screen buffer of the size of the picture."""
     spec = spec.copy()
     spec.visual.global_.offwidth = width
     spec.visual.global_.offheight = height

@@ -1,4 +1,4 @@
-"""What world and dream share towards TorchRL: each row carries the body that was simulated, and its reward.
+"""The side of bodies and dream that TorchRL sees: each row has the design that was simulated, and its reward.
 
 Shapes: ``*B`` batch of the environment, S observation, D design, A action.
 """
@@ -14,15 +14,15 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 RewardFn = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-# What a transform and its inverse leave of a float32 design.
+# Rounding of a float32 design by a transform and its inverse.
 RELATIVE_ROUNDING, ABSOLUTE_ROUNDING = 1e-4, 1e-5
 
 
 class DesignedEnv(EnvBase):
-    """An environment with a design, which only a reset changes."""
+    """An environment with a design that only a reset changes."""
 
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        """TorchRL's reset; an empty tensordict asks for nothing, so that the designs stay, and is filled."""
+        """Reset as TorchRL does; an empty tensordict keeps the designs, and is filled."""
         if tensordict is None or not tensordict.is_empty():
             return super().reset(tensordict, **kwargs)
         self._assert_tensordict_shape(tensordict)
@@ -30,20 +30,20 @@ class DesignedEnv(EnvBase):
 
 
 def idle_rows(tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor | None:
-    """Rows that TorchRL asks to leave as they are, by a ``_step`` in the input of a step, as ``ConditionalSkip`` does.
+    """Read which rows shall not be stepped, from TorchRL's entry ``_step``, which ``ConditionalSkip`` writes.
 
     Returns:
-        ``[*B]`` bool; None where all rows are stepped.
+        ``[*B]`` bool; None if all rows are stepped.
     """
     stepped = tensordict.get("_step", None)
     return None if stepped is None else ~stepped.reshape(batch_size)
 
 
 def leave_idle(after: MutableMapping[str, Tensor], before: TensorDictBase, idle: Tensor) -> None:
-    """Answer for rows that were not stepped, in place: no reward, and the flags that they had.
+    """Correct the result for rows that were not stepped, in place: no reward, and the same flags as before.
 
     Args:
-        after: answer of a step, ``[*B]``.
+        after: result of a step, ``[*B]``.
         before: input of the step, ``[*B]``.
         idle: ``[*B]`` bool.
     """
@@ -53,16 +53,16 @@ def leave_idle(after: MutableMapping[str, Tensor], before: TensorDictBase, idle:
 
 
 def check_step(given: Tensor | None, body: Tensor) -> None:
-    """Refuse a step whose input holds another design than that of the bodies that it moves.
+    """Refuse a step if its input has another design than the simulated bodies.
 
     The row would pair the design of one body with the motion of another.
 
     Args:
         given: ``design`` in the input of the step, or None if there is none.
-        body: ``[*B, D]``, the designs of the bodies.
+        body: ``[*B, D]``, designs of the bodies.
 
     Raises:
-        ValueError: they differ by more than the rounding of a transform and its inverse.
+        ValueError: if the two differ by more than the rounding of a transform and its inverse.
     """
     if given is None or given is body or torch.equal(given, body):
         return
@@ -79,17 +79,17 @@ def check_step(given: Tensor | None, body: Tensor) -> None:
 
 
 def check_reset(given: TensorDictBase | None, readable: tuple[str, ...], design_shape: torch.Size) -> None:
-    """Refuse to reset from a tensordict whose design has lost its name on the way.
+    """Refuse a reset if a transform has renamed the design in its input.
 
-    Under a ``RenameTransform`` the bodies would stay as they are without a word.
+    Otherwise, with a ``RenameTransform``, the bodies would silently not change.
 
     Args:
-        given: what the reset is called with.
-        readable: keys that it reads beside ``_reset``.
+        given: input of the reset.
+        readable: keys that the reset reads, besides ``_reset``.
         design_shape: ``[*B, D]``.
 
     Raises:
-        ValueError: none of the keys is there, and nothing is, or another entry of the shape of a design.
+        ValueError: if none of the keys is present, and the input is empty or has another entry of a design's shape.
     """
     if given is None or any(key in given for key in ("_reset", *readable)):
         return
@@ -104,19 +104,19 @@ def check_reset(given: TensorDictBase | None, readable: tuple[str, ...], design_
 
 
 def check_reward(reward: RewardFn, observation: Tensor, action: Tensor, design: Tensor, *, name: str) -> None:
-    """Try a reward function out.
+    """Check the shape and the dtype of a reward function by calling it.
 
     Args:
         reward: ``(observation, action, next_observation, design) -> [*B, 1]``.
-        observation: ``[*B, S]``, any.
-        action: ``[*B, A]``, any.
-        design: ``[*B, D]``, any.
-        name: of the environment, for the sentence.
+        observation: ``[*B, S]``, any values.
+        action: ``[*B, A]``, any values.
+        design: ``[*B, D]``, any values.
+        name: name of the environment, for the message.
 
     Raises:
-        ValueError: it does not return ``[*B, 1]`` numbers of the observation's dtype.
+        ValueError: if it does not return ``[*B, 1]`` numbers in the observation's dtype.
     """
-    # A whole episode is rewarded at once: one more batch dimension.
+    # Rewards of a whole episode are computed at once, with one more batch dimension.
     here, torques, body = (value.expand(2, *value.shape) for value in (observation, action, design))
     found, wanted = reward(here, torques, here.clone(), body), [*here.shape[:-1], 1]
     if list(found.shape) != wanted or found.dtype != here.dtype:

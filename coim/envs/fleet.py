@@ -1,6 +1,6 @@
-"""A fleet of bodies on tensors: what is built, placed, moved and looked at, without TorchRL.
+"""A fleet of simulated bodies with tensors as inputs and outputs, without TorchRL.
 
-Shapes: K runs (rows of the fleet), S observation, D design, A action. Everything that is simulated is on the CPU.
+Shapes: K runs (rows of the fleet), S observation, D design, A action. All simulations run on the CPU.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from coim.randomness import restore_generator
 
 
 class Fleet:
-    """The bodies of :class:`~coim.envs.morph.MorphEnv`: constants and :meth:`shape_body` say which.
+    """The bodies of :class:`~coim.envs.morph.MorphEnv`; a subclass defines them by constants and :meth:`shape_body`.
 
     Attributes:
-        simulations: the native fleet: live positions, velocities and compiled bodies, for whoever looks beneath.
-        num_broken: how often each row's simulation broke so far, ``[K]`` int64.
+        simulations: the simulations themselves: live positions and velocities, and the compiled bodies.
+        num_broken: how often the simulation of each row has broken, ``[K]`` int64.
     """
 
     ASSET: ClassVar[str]  # XML file in assets/, or an absolute path
     DESIGN_SIZE: ClassVar[int]
-    DESIGN_NAMES: ClassVar[tuple[str, ...]] = ()  # of the design's entries; see design_names()
+    DESIGN_NAMES: ClassVar[tuple[str, ...]] = ()  # names of the design's entries; see design_names()
     DESIGN_BOUNDS: ClassVar[tuple[float, float]]
     FRAME_SKIP: ClassVar[int]  # simulation steps in an environment step
     RESET_NOISE: ClassVar[float]
     OBSERVATION_SCALE: ClassVar[tuple[float, ...]]  # standard deviations under random actions at xi = 1, rounded
-    FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]]  # that a recipe's run tries first
+    FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]]  # the designs that a run tries first
 
-    _first_position = 1  # of qpos in the observation: the root's x is left out
+    _first_position = 1  # index of the first observed entry of qpos: the root's x is not observed
 
     reset_noise: float
 
@@ -58,7 +58,7 @@ class Fleet:
         self.num_broken = torch.zeros(num_runs, dtype=torch.int64, device="cpu")
 
     def _simulate(self) -> Simulations:
-        """A fleet of the present designs."""
+        """Make the simulations of the current designs."""
         return Simulations(
             mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / self.ASSET)),
             shape_body=self.shape_body,
@@ -68,22 +68,22 @@ class Fleet:
 
     @abstractmethod
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
-        """Turn the body as drawn into the body of a design, in place.
+        """Change the body at xi = 1 into the body of a design, in place.
 
         Args:
-            spec: the body as drawn, xi = 1.
+            spec: the body of the XML file, xi = 1.
             design: scale factors within the bounds, ``[D]`` float64.
         """
 
     def clearance(self, observation: Tensor, design: Tensor) -> Tensor:
-        """Height in m of the lowest point of a body above the floor, negative in it; differentiable in both.
+        """Height in m of a body's lowest point above the floor, negative below it; differentiable in both arguments.
 
         Args:
             observation: ``[*B, S]``.
             design: ``[*B, D]``.
 
         Returns:
-            ``[*B, 1]``; MuJoCo's own geometry to the precision of the observation.
+            ``[*B, 1]``, equal to MuJoCo's geometry up to the precision of the observation.
 
         Example:
             >>> from coim import HopperMorph
@@ -97,14 +97,14 @@ class Fleet:
         return self._kinematics.lowest(torch.cat([unseen, positions], -1), design)
 
     def transfer(self, observation: Tensor, design: Tensor, new_design: Tensor) -> Tensor:
-        """Give the state of one body to another: same joints, velocities and clearance; the root moves up or down.
+        """Transfer the state of one body to another: same joints, velocities and clearance; the root moves up or down.
 
-        A state holds the height of the root, which belongs to the legs that it was seen with: kept under other legs it
-        is a foot in the floor or a body in the air, a state that the other body cannot be in.
+        A state has the height of the root, which depends on the legs. With other legs and the same height, a foot would
+        be in the floor or the body in the air: a state that the other body cannot be in.
 
         Args:
             observation: ``[*B, S]``.
-            design: ``[*B, D]``, the body that the state was seen with.
+            design: ``[*B, D]``, the body of the state.
             new_design: ``[*B, D]``. The batches of the three are broadcast: ``[n, S], [n, D], [P, 1, D]`` puts each of
                 n states under each of P bodies.
 
@@ -134,7 +134,7 @@ class Fleet:
         )
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Reset noise of one row for ``reset_noise=1``: uniform in [-1, 1], positions and velocities, float64."""
+        """Draw one row's noise for ``reset_noise=1``: positions and velocities, uniform in [-1, 1], float64."""
         size = num_positions + num_velocities
         noise = 2 * torch.rand(size, generator=generator, dtype=torch.float64, device="cpu") - 1
         return noise[:num_positions], noise[num_positions:]
@@ -146,11 +146,11 @@ class Fleet:
             action: motor torques as shares of the motors' strength, ``[K, A]``; MuJoCo clips them to [-1, 1].
 
         Returns:
-            Next observation ``[K, S]`` and whether the simulation broke ``[K, 1]``, on the action's device: actions on
-            the CPU step the fleet without a word to another device.
+            Next observation ``[K, S]`` and whether the simulation broke ``[K, 1]``, on the action's device. If the
+            actions are on the CPU, no other device is used.
 
         Raises:
-            ValueError: the action has another shape or a number that is not finite; nothing has moved then.
+            ValueError: if the action has another shape, or a number that is not finite; the bodies have not moved then.
         """
         device, action = action.device, action.detach().cpu()
         if action.shape != self.simulations.ctrl.shape:
@@ -168,23 +168,23 @@ class Fleet:
             observation[broken] = self._observation[broken]
             terminated[broken] = True
             self.num_broken[broken] += 1
-        self._observation = observation.clone()  # ours; what is handed out may be written to
+        self._observation = observation.clone()  # our own copy: the caller may write to the returned one
         self._step_count += 1
         return observation.to(device), terminated.to(device)
 
     def place(self, observation: Tensor, design: Tensor) -> None:
-        """Set all simulations to a state and a body each, to compare a learnt model with the truth.
+        """Set the state and the body of each simulation, to compare a learnt model with the simulator.
 
         Args:
-            observation: ``[K, S]``; a root x that it does not hold becomes 0.
+            observation: ``[K, S]``; if it does not have the root's x, that becomes 0.
             design: ``[K, D]``.
 
         Raises:
-            ValueError: a wrong shape, a number that is not finite, or a design out of bounds.
+            ValueError: if a shape is wrong, a number is not finite, or a design is out of bounds.
 
         Note:
-            The solver's warm start is no part of an observation: the next step agrees with the one that was once seen
-            from here to the precision of float32, not to the last bit.
+            An observation does not have the solver's warm start. The next step equals the original one up to the
+            precision of float32, not to the last bit.
         """
         state = observation.detach().cpu().double().numpy()
         if state.shape != self._observation.shape or not np.isfinite(state).all():
@@ -204,10 +204,10 @@ class Fleet:
 
     @contextmanager
     def holding(self, rows: Tensor | None) -> Iterator[None]:
-        """Let some rows stand still while the fleet moves.
+        """Keep the state of some rows while the fleet moves.
 
         Args:
-            rows: ``[K]`` bool, on the CPU; None holds none.
+            rows: ``[K]`` bool, on the CPU; None keeps none.
         """
         if rows is None:
             yield
@@ -223,9 +223,9 @@ class Fleet:
             value[rows] = before[key]
 
     def get_simulation_state(self) -> TensorDict:
-        """All that the coming steps and resets depend on, ``[K]``: bodies, simulations, generators, counters.
+        """Return everything that later steps and resets depend on, ``[K]``: bodies, simulations, generators, counters.
 
-        Rows of it may be loaded into another fleet, which goes on as these rows would have, to the last bit.
+        Another fleet can load rows of it, and then continues exactly as these rows would, to the last bit.
         """
         state = {
             "design": self._design,
@@ -238,10 +238,10 @@ class Fleet:
         return TensorDict(state, [len(self._design)], device="cpu").clone()
 
     def set_simulation_state(self, state: TensorDictBase) -> None:
-        """Go on from where :meth:`get_simulation_state` was called.
+        """Continue from a state of :meth:`get_simulation_state`.
 
         Raises:
-            ValueError: the state is one of another number of runs.
+            ValueError: if the state has another number of runs.
         """
         if state.batch_size != self._design.shape[:1]:
             raise ValueError(
@@ -257,35 +257,35 @@ class Fleet:
         )
 
     def capsules(self, run: int = 0) -> Tensor:
-        """Outline of one row as it stands, ``[segments, 5]``: x and z of both ends and the radius, in m."""
+        """Return the current outline of one row, ``[segments, 5]``: x and z of both ends and the radius, in m."""
         return torch.from_numpy(self.simulations.capsules(run))
 
     def render(self, run: int = 0, *, width: int = 480, height: int = 360) -> np.ndarray:
-        """A picture of one row as it stands, ``[height, width, 3]`` uint8, about 0.1 s without a graphics card.
+        """Draw one row in its current pose, ``[height, width, 3]`` uint8; about 0.1 s without a graphics card.
 
         Raises:
-            RuntimeError: there is no OpenGL; the sentence says what to set and install.
+            RuntimeError: if there is no OpenGL; the message says what to set and install.
         """
         with self.camera(run, width=width, height=height) as camera:
             return camera.photograph(self.simulations.qpos[run])
 
     def camera(self, run: int = 0, *, width: int = 480, height: int = 360) -> Camera:
-        """A camera for many pictures of one row's present body, from any ``simulations.qpos``; see :meth:`render`."""
+        """Return a camera for many pictures of one row's current body, in any pose ``qpos``; see :meth:`render`."""
         return Camera(self.simulations.body(self._design[run].numpy()), width=width, height=height)
 
     @property
     def step_seconds(self) -> float:
-        """What a step takes in the simulated world, in s."""
+        """Simulated time of one step, in s."""
         return self.FRAME_SKIP * self.simulations.model(0).opt.timestep
 
     def _seed_rows(self, seed: int) -> None:
-        """Give every row a generator of its own, derived from (seed, row)."""
+        """Give each row its own generator, derived from (seed, row)."""
         rows = range(len(self._design))
         words = [np.random.SeedSequence([seed, row]).generate_state(1, np.uint32)[0] for row in rows]
         self._generators = [torch.Generator("cpu").manual_seed(int(word)) for word in words]
 
     def _build(self, design: Tensor, rows: np.ndarray) -> None:
-        """Check the designs of the given rows, ``design [K, D]``, and build those that are new."""
+        """Check the designs of the given rows, ``design [K, D]``, and build the new ones."""
         if design.shape != self._design.shape:
             raise ValueError(f"design has shape {list(design.shape)}, this fleet takes {list(self._design.shape)}")
         wanted = design.detach().to("cpu", torch.float32)[rows]
@@ -300,7 +300,7 @@ class Fleet:
             self._design[rows] = wanted
 
     def _start(self, rows: np.ndarray) -> None:
-        """Begin new episodes: the start pose of each body, noise from the row's own generator, no foot in the floor."""
+        """Start new episodes: the start pose of each body, plus the row's own noise, with no foot in the floor."""
         simulations = self.simulations
         simulations.start(rows)
         for row in rows:
@@ -314,7 +314,7 @@ class Fleet:
         self._observation[rows] = self._see()[rows]
 
     def _see(self) -> Tensor:
-        """The observation ``[K, S]`` of the simulations as they stand: ``qpos, qvel`` with the pitch wrapped."""
+        """Return the current observation ``[K, S]``: ``qpos, qvel`` with the pitch wrapped."""
         state = np.concatenate((self.simulations.qpos[:, self._first_position :], self.simulations.qvel), axis=1)
         pitch = state[:, PITCH - self._first_position]
         pitch -= math.tau * np.ceil(pitch / math.tau - 0.5)  # wrap_angle, before precision is lost to float32

@@ -54,11 +54,11 @@ class HalfCheetahMorph(MorphEnv):
     The six actions are the torques of the six joints in the same order, as shares of 120, 90, 60, 120, 60, 30 N m. A
     step takes 0.05 s.
 
-    Reward: ``clamp(dx / 10, 0, 10)``, dx the horizontal speed in m/s after the step. The paper prints max(dx / 10, 10),
-    which would be constant at every speed that is possible; its predecessor's code has max(dx / 10, 0).
+    Reward: ``clamp(dx / 10, 0, 10)``, with the horizontal speed dx in m/s after the step. The paper prints
+    max(dx / 10, 10), which would be constant at all possible speeds; its predecessor's code has max(dx / 10, 0).
 
-    The paper prints the back leg's lengths for the front leg too. The body at xi = 1 is Gymnasium's, which has the
-    shorter front leg of the table; ``segment_lengths=(0.29, 0.3, 0.188, 0.29, 0.3, 0.188)`` builds the printed one.
+    The paper prints the lengths of the back leg for the front leg too. The body at xi = 1 is Gymnasium's, whose front
+    leg is shorter (see the table); ``segment_lengths=(0.29, 0.3, 0.188, 0.29, 0.3, 0.188)`` builds the printed one.
     Density is constant (660.885 kg/m^3, 14 kg at xi = 1), so longer legs are heavier and the torso keeps its mass.
 
     Keyword Args:
@@ -120,7 +120,7 @@ class HalfCheetahMorph(MorphEnv):
         )
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
-        """Scale each segment and what hangs on it; the feet start as far above the floor as those of the drawn body."""
+        """Scale each segment and move its children; the feet start at the same height above the floor as at xi = 1."""
         drop_as_drawn = _leg_drop(spec)
         scales = (design * self._stretch).reshape(2, 3)
         for leg, leg_scales in zip(LEGS, scales):
@@ -134,7 +134,7 @@ class HalfCheetahMorph(MorphEnv):
         torso.pos = torso.pos + np.array([0.0, 0.0, _leg_drop(spec) - drop_as_drawn])
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Reset noise of one row for ``reset_noise=1``: uniform positions in [-1, 1], normal velocities (Gymnasium)."""
+        """Draw one row's noise for ``reset_noise=1``: uniform positions, normal velocities, as in Gymnasium."""
         positions = 2 * torch.rand(num_positions, generator=generator, dtype=torch.float64, device="cpu") - 1
         return positions, torch.randn(num_velocities, generator=generator, dtype=torch.float64, device="cpu")
 
@@ -144,7 +144,7 @@ class HalfCheetahMorph(MorphEnv):
     ) -> Tensor:
         """``clamp(dx / 10, 0, 10)`` for ``[*B, 17]`` observations, ``[*B, 1]``.
 
-        The paper prints max(dx / 10, 10); ours reads it as a clamp from 0 to 10.
+        The paper prints max(dx / 10, 10); this is read as a clamp from 0 to 10.
 
         Example:
             >>> next_observation = torch.zeros(17)
@@ -156,13 +156,13 @@ class HalfCheetahMorph(MorphEnv):
 
 
 def _leg_drop(spec: mujoco.MjSpec) -> float:
-    """How far the lowest capsule of the legs reaches below the torso's centre with all joints at zero, in m."""
+    """Return the distance in m from the torso's centre down to the lowest point of the legs, with all joints at 0."""
     lowest = 0.0
     for leg in LEGS:
         height = 0.0
         for name in leg:
             height += spec.body(name).pos[2]
             geom = spec.geom(name)
-            half_rise = geom.size[1] * abs(np.cos(geom.alt.axisangle[3]))  # the capsules are turned about y
+            half_rise = geom.size[1] * abs(np.cos(geom.alt.axisangle[3]))  # the capsules are rotated about y
             lowest = min(lowest, height + geom.pos[2] - half_rise - geom.size[0])
     return -lowest

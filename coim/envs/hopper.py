@@ -23,7 +23,7 @@ from coim.envs.walker import ANKLE, shape_leg, shape_torso
 
 HEIGHT, PITCH_ANGLE, FORWARD_VELOCITY = 0, 1, 5  # entries of the observation
 TORSO, THIGH, SHANK, FOOT = 0.4, 0.45, 0.5, 0.39  # m at xi = 1
-TOE = 1 / 3  # the part of the foot's length by which its body lies before the ankle
+TOE = 1 / 3  # share of the foot's length that is in front of the ankle
 
 
 class HopperMorph(MorphEnv):
@@ -70,8 +70,7 @@ class HopperMorph(MorphEnv):
     FRAME_SKIP = 4
     RESET_NOISE = 0.005
     OBSERVATION_SCALE = (0.3, 1.5, 1.0, 1.0, 0.5, 0.5, 0.7, *[2.5] * 4)  # m, rad, m/s, rad/s
-    # The unit body and four draws from the uniform distribution, kept so that every run starts with the same five (Sec.
-    # 6.1).
+    # The unit body and four fixed draws from the uniform distribution: every run starts with the same five (Sec. 6.1).
     FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]] = (
         (1.0, 1.0, 1.0, 1.0),
         (1.91, 1.27, 1.96, 0.62),
@@ -79,12 +78,12 @@ class HopperMorph(MorphEnv):
         (1.81, 1.32, 1.85, 1.22),
         (1.15, 1.68, 1.98, 1.05),
     )
-    STANDING_HEIGHT = 0.5  # m; below it only a tenth of speed and survival is paid
+    STANDING_HEIGHT = 0.5  # m; below it, the reward has only a tenth of the terms for speed and survival
     FALLEN_SHARE = 0.1
     PITCH_COST = 0.1  # 1/rad
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
-        """Set every length; the torso starts at the height at which the leg stands."""
+        """Set all lengths; the torso starts at the height of the extended leg."""
         torso, thigh, shank, foot = design * (TORSO, THIGH, SHANK, FOOT)
         shape_leg(spec, "", thigh=thigh, shank=shank, foot=foot, toe=TOE * foot)
         shape_torso(spec, torso, height=torso / 2 + thigh + shank + ANKLE)

@@ -1,8 +1,8 @@
-"""How high a body stands, as a torch function of its joints and its design.
+"""Height of a body above the floor, as a torch function of its joints and its design.
 
-The tables of a compiled body (offsets, anchors, sizes) are affine in the design where lengths scale. They are read from
-a few compiled bodies and checked on others. What follows is forward kinematics of which only heights are kept: for each
-body frame the height of its origin, and the direction "up" in its own axes.
+The tables of a compiled body (offsets, anchors, sizes) are affine functions of the design if only lengths scale. They
+are fitted on a few compiled bodies and checked on others. The rest is forward kinematics of heights alone: for each
+body frame, the height of its origin, and the direction "up" in its own axes.
 
 Shapes: *B any batch, Q positions, D design, J joints, G geoms.
 
@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 UP = 2  # axis of the world that points away from the floor
-EXACT = 1e-9  # m: largest error of the affine function that stands for a table of the body
-CHECKED = 16  # random designs, and as many corners of the design space, on which the tables are checked
+EXACT = 1e-9  # m: largest allowed error of the affine function of a table
+CHECKED = 16  # number of random designs, and of corners of the design space, on which the tables are checked
 SPHERE, CAPSULE, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SPHERE", "CAPSULE", "BOX"))
 FREE, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "SLIDE", "HINGE"))
 
@@ -42,13 +42,13 @@ class Kinematics:
         height: entry of the positions that moves the whole body up, in m.
 
     Raises:
-        ValueError: the body has a joint or a shape that is not known here, nothing that moves it up and down, or
-            lengths that are no affine functions of the design.
+        ValueError: if the body has an unknown joint or shape, no joint that moves it up and down, or lengths that are
+            not affine functions of the design.
 
     Note:
-        The height at which the body starts may be any function of the design, as long as either the positions measure
-        it from the floor or the clearance at the start is affine in the design: bodies are built so that the lowest of
-        several feet starts at one height.
+        The height of the body at its start may be any function of the design, if either the positions measure it from
+        the floor, or the clearance at the start is affine in the design. For example, the lowest of several feet starts
+        at the same height for every design.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Kinematics:
         return positions[..., self.height, None] + start + hanging
 
     def _hanging(self, positions: Tensor, design: Tensor) -> Tensor:
-        """Height of the lowest point over the root's origin, ``[*B, 1]``; what moves the body up is not read."""
+        """Height of the lowest point over the root's origin, ``[*B, 1]``, whatever the height of the root."""
         body_pos, jnt_pos = self._table("body_pos", design), self._table("jnt_pos", design)
         geom_pos, geom_size = self._table("geom_pos", design), self._table("geom_size", design)
         batch = torch.broadcast_shapes(positions.shape[:-1], design.shape[:-1])
@@ -111,7 +111,7 @@ class Kinematics:
     def _move(
         self, joint: int, up: Tensor, height: Tensor, positions: Tensor, jnt_pos: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Let one joint move its body: "up" as the body sees it, and the height of its origin."""
+        """Apply one joint: return "up" in the axes of its body, and the height of the body's origin."""
         at, kind = int(self._model.jnt_qposadr[joint]), int(self._model.jnt_type[joint])
         if kind == FREE:
             w, x, y, z = torch.nn.functional.normalize(positions[..., at + 3 : at + 7], dim=-1).unbind(-1)
@@ -122,14 +122,14 @@ class Kinematics:
         moved = (positions[..., at] - float(self._model.qpos0[at]))[..., None]
         if kind == SLIDE:
             return up, height + (up * axis * moved).sum(-1)
-        # The joint's anchor stays where it is. "Up" turns against the body: Rodrigues' formula with -angle.
+        # The joint's anchor does not move. "Up" rotates opposite to the body: Rodrigues' formula with -angle.
         anchor = height + (up * jnt_pos[..., joint, :]).sum(-1)
         along = (up * axis).sum(-1, keepdim=True) * axis
         up = along + (up - along) * moved.cos() + torch.linalg.cross(up, axis.expand_as(up)) * moved.sin()
         return up, anchor - (up * jnt_pos[..., joint, :]).sum(-1)
 
     def _extent(self, geom: int, up: Tensor, size: Tensor) -> Tensor:
-        """How far a geom reaches below its centre, ``[*B]``."""
+        """Return the distance from the centre of a geom down to its lowest point, ``[*B]``."""
         seen = up @ self._like(self._geom_turn[geom], up)
         kind = self._geom_type[geom]
         if kind == SPHERE:
@@ -139,7 +139,7 @@ class Kinematics:
         return (size * seen.abs()).sum(-1)
 
     def _read_tree(self, model: mujoco.MjModel) -> None:
-        """Read what does not depend on the design; refuse what is not known here."""
+        """Read everything that does not depend on the design; refuse unknown joints and shapes."""
         self._model = model
         self._parents = [int(parent) for parent in model.body_parentid]
         self._joints = [range(start, start + number) for start, number in zip(model.body_jntadr, model.body_jntnum)]
@@ -160,13 +160,13 @@ class Kinematics:
             )
         roots = [body for body, parent in enumerate(self._parents) if body and not parent]
         if len(roots) != 1:
-            raise ValueError(f"the file has {len(roots)} bodies that hang on nothing; a robot has one root")
+            raise ValueError(f"the file has {len(roots)} bodies without a parent; a robot has one root")
         self.num_positions = model.nq
         self._root, self.height = roots[0], self._find_height(model)
         self._positions_at_start = torch.from_numpy(model.qpos0.copy())
 
     def _tables(self, model: mujoco.MjModel) -> dict[str, np.ndarray]:
-        """Lengths that may depend on the design, in m; without where the root starts and where slides are drawn."""
+        """Lengths that may depend on the design, in m, except the start of the root and the positions of slides."""
         body_pos, jnt_pos = model.body_pos.copy(), model.jnt_pos.copy()
         body_pos[self._root] = 0.0
         jnt_pos[model.jnt_type != HINGE] = 0.0
@@ -184,7 +184,7 @@ class Kinematics:
         raise ValueError("nothing moves this body up and down: its root has neither a free joint nor a vertical slide")
 
     def _fit_start(self, models: list[mujoco.MjModel]) -> None:
-        """Find the height of the root where its entry of the positions is 0, or else the clearance at the start."""
+        """Fit the height of the root at position 0, or, if it is not affine, the clearance at the start."""
         starts = np.array([[model.body_pos[self._root, UP] - model.qpos0[self.height]] for model in models])
         self._affine["start"], error = _affine_fit(self._designs, starts)
         self._start_is_clearance = error > EXACT
@@ -194,16 +194,16 @@ class Kinematics:
             self._affine["start"] = self._fit("clearance at the start", starts + hanging.numpy())
 
     def _fit(self, name: str, values: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Constant and slope of a table as an affine function of the design."""
+        """Fit a table by an affine function of the design: its constant and slope."""
         fitted, error = _affine_fit(self._designs, values)
         if error > EXACT:
             raise ValueError(
-                f"{name} of this body is no affine function of its design (off by {error:.2g} m); override clearance()"
+                f"{name} of this body is not affine in its design (off by {error:.2g} m); override clearance()"
             )
         return fitted
 
     def _table(self, name: str, design: Tensor) -> Tensor:
-        """A table of the body of each design, ``[*B, ...]``."""
+        """Evaluate a table for each design, ``[*B, ...]``."""
         constant, slope = (self._like(part, design) for part in self._affine[name])
         return constant + torch.tensordot(design, slope, 1)
 

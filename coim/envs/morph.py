@@ -1,4 +1,4 @@
-"""A fleet of robots whose bodies are set by a design, as a TorchRL environment: what all morphs share.
+"""A fleet of robots with designed bodies as a TorchRL environment: the base class of all bodies.
 
 Shapes: K runs (rows of the fleet), S observation, D design, A action.
 
@@ -32,44 +32,44 @@ DONE_KEYS = ("done", "terminated", "truncated")
 
 
 class MorphEnv(Fleet, DesignedEnv):
-    """A fleet of robots whose bodies are set by a design vector at reset.
+    """A fleet of robots; a design vector sets their bodies at reset.
 
     A new body is a subclass: an XML file of a planar runner (see `coim.envs.planar`), the constants of
     :class:`~coim.envs.fleet.Fleet`, :meth:`shape_body` (which lengths scale) and :meth:`reward`.
 
-    The design enters through the reset tensordict, ``env.reset(TensorDict({"design": xi}, [K]))``, and stays until
-    another one comes: auto-resets, partial resets and resets without ``design`` keep it. The unit body is the first.
-    Only a reset changes a body: a step whose input holds another ``design`` is refused. To draw a body per episode in a
+    The input of a reset sets the design: ``env.reset(TensorDict({"design": xi}, [K]))``. It stays until a reset gives
+    another one: auto-resets, partial resets and resets without ``design`` keep it. The first body has xi = 1. Only a
+    reset changes a body: a step with another ``design`` in its input is refused. To draw a body for each episode of a
     collector, let a transform write it before the reset::
 
         draw = TensorDictPrimer(env.state_spec, random=True, call_before_env_reset=True)
         Collector(TransformedEnv(env, draw), policy, frames_per_batch=1000)
 
-    Falling does not end an episode. It is *truncated* after ``episode_steps`` steps. A row is *terminated* only if its
-    simulation breaks (see :meth:`~coim.envs.simulation.Simulations.step`): it then hands out its last finite
-    observation, ``num_broken`` counts it, and its robot stands at its start until the row is reset. No other row
-    notices.
+    A fall does not end an episode. The episode is *truncated* after ``episode_steps`` steps. A row is *terminated* only
+    if its simulation breaks (see :meth:`~coim.envs.simulation.Simulations.step`). It then returns its last finite
+    observation, ``num_broken`` counts it, and its robot stays at its start until the row is reset. Other rows are not
+    affected.
 
-    The pitch is wrapped to (-pi, pi], in the observation and in the rewards: its hinge is unbounded and a fallen robot
-    may roll on. Velocities are not clipped, as Gymnasium's walker and hopper do at 10.
+    The pitch is wrapped to (-pi, pi], in observations and rewards: its hinge has no limits, and a fallen robot can roll
+    over. Velocities are not clipped; Gymnasium's walker and hopper clip them at 10.
 
     Keyword Args:
         num_runs: rows K of the fleet, the environment's batch size ``[K]``.
-        task: ``"forward"``, or ``"backward"`` with the sign of the speed turned (Fig. 1, second row).
+        task: ``"forward"``, or ``"backward"`` with the opposite sign of the speed (Fig. 1, second row).
         episode_steps: steps after which an episode is truncated (1000 in Sec. 6.1).
-        reset_noise: spread of the start state, in m, rad, m/s and rad/s; Gymnasium's by default, 0 for the bare start.
-        seed: of the reset noise; every row has a generator of its own, derived from (seed, row). Drawn from torch if
-            unset.
+        reset_noise: spread of the start state, in m, rad, m/s and rad/s; Gymnasium's by default, 0 for no noise.
+        seed: seed of the reset noise; each row has its own generator, derived from (seed, row). Drawn from torch's
+            global generator if None.
         num_threads: native threads that share the rows. They do not change the results.
-        device: where the tensors go, by default torch's default device. The simulations themselves run on the CPU.
+        device: device of the tensors, torch's default device if None. The simulations always run on the CPU.
 
     Attributes:
-        simulations: the native fleet: live positions, velocities and compiled bodies, for whoever looks beneath.
-        num_broken: how often each row's simulation broke so far, ``[K]`` int64.
+        simulations: the simulations themselves: live positions and velocities, and the compiled bodies.
+        num_broken: how often the simulation of each row has broken, ``[K]`` int64.
 
     Raises:
-        ValueError: an argument is out of range, the device is not there, the names or bounds of the design's entries
-            or the scale of the observation do not fit, the body is no planar runner, or the reward is not ``[*B, 1]``.
+        ValueError: if an argument is out of range, the device does not exist, the names or bounds of the design or the
+            scale of the observation do not fit, the body is not a planar runner, or the reward is not ``[*B, 1]``.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class MorphEnv(Fleet, DesignedEnv):
         self.reset_noise = self.RESET_NOISE if reset_noise is None else reset_noise
         if not 0 <= self.reset_noise < math.inf:
             raise ValueError(
-                f"reset_noise {self.reset_noise} is not a finite number of at least 0; 0 gives the bare start"
+                f"reset_noise {self.reset_noise} is not a finite number of at least 0; 0 gives a start without noise"
             )
         super().__init__(device=_existing(device), batch_size=torch.Size([num_runs]))
         self._begin(num_runs, num_threads)
@@ -105,7 +105,7 @@ class MorphEnv(Fleet, DesignedEnv):
     def reward(
         observation: Tensor, action: Tensor, next_observation: Tensor, design: Tensor, task: Task = "forward"
     ) -> Tensor:
-        """The reward, a pure function that the world and the dream share (the reward is known: Sec. 3).
+        """The reward: a pure function, used by the real bodies and the dream (the reward is known: Sec. 3).
 
         Args:
             observation: ``[*B, S]``.
@@ -120,10 +120,10 @@ class MorphEnv(Fleet, DesignedEnv):
 
     @classmethod
     def design_names(cls) -> tuple[str, ...]:
-        """Names of the D entries of a design, ``DESIGN_NAMES``, or ``design 0, design 1, ...`` of a body without them.
+        """Return names of the D entries of a design: ``DESIGN_NAMES``, or by default ``design 0, design 1, ...``.
 
         Raises:
-            ValueError: they are not D different names of letters and digits; words may have spaces between them.
+            ValueError: if they are not D different names of letters, digits and single spaces between words.
         """
         if not cls.DESIGN_NAMES:
             return tuple(f"design {i}" for i in range(cls.DESIGN_SIZE))
@@ -149,19 +149,20 @@ class MorphEnv(Fleet, DesignedEnv):
 
     @property
     def observation_scale(self) -> Tensor:
-        """Typical spread of each observation, ``[S]``: networks divide by it."""
-        scale = self.OBSERVATION_SCALE[-self.observation_spec["observation"].shape[-1] :]  # without root x: the rest
+        """Typical spread of each observation, ``[S]``; networks divide by it."""
+        # The last entries: without root x if it is not observed.
+        scale = self.OBSERVATION_SCALE[-self.observation_spec["observation"].shape[-1] :]
         return torch.tensor(scale, dtype=torch.float32, device=self.device)
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
-        """Entries of the observation that are angles wrapped to (-pi, pi]."""
+        """Indices of the observation's entries that are angles, wrapped to (-pi, pi]."""
         return (PITCH - self._first_position,)
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Step the fleet on tensors: :meth:`step` without its tensordicts, many times faster for few rows.
+        """Step the fleet with tensors: like :meth:`step`, without tensordicts, and many times faster for few rows.
 
-        :meth:`move` is this without the reward, which :meth:`reward` gives for a whole episode at once.
+        :meth:`move` does the same without the reward; :meth:`reward` computes those of a whole episode at once.
 
         Args:
             action: motor torques as shares of the motors' strength, ``[K, A]``; MuJoCo clips them to [-1, 1].
@@ -171,7 +172,7 @@ class MorphEnv(Fleet, DesignedEnv):
             device.
 
         Raises:
-            ValueError: the action has another shape or a number that is not finite; nothing has moved then.
+            ValueError: if the action has another shape, or a number that is not finite; the bodies have not moved then.
         """
         before = self._observation
         observation, terminated = self.move(action)
@@ -179,7 +180,7 @@ class MorphEnv(Fleet, DesignedEnv):
         return observation, reward.to(action.device), terminated
 
     def __getstate__(self) -> dict[str, Any]:
-        """All of it for pickle and deepcopy: the bodies are compiled anew, and go on from the same state."""
+        """Return the state for pickle and deepcopy: a copy compiles the bodies again, and continues from it."""
         live = ("simulations", "_generators")
         state = {key: value for key, value in super().__getstate__().items() if key not in live}
         return state | {"simulation_state": self.get_simulation_state()}
@@ -188,7 +189,7 @@ class MorphEnv(Fleet, DesignedEnv):
         simulation_state = state.pop("simulation_state")
         super().__setstate__(state)
         self.simulations = self._simulate()
-        self._seed_rows(0)  # only to have generators, whose states follow
+        self._seed_rows(0)  # makes the generators; set_simulation_state restores their states
         self.set_simulation_state(simulation_state)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -200,7 +201,7 @@ class MorphEnv(Fleet, DesignedEnv):
         design = self.design_spec.expand(*shape, self.DESIGN_SIZE)
         observation = Unbounded(self._observation.shape, dtype=torch.float32, device=device)
         self.observation_spec = Composite(observation=observation, design=design.clone(), shape=shape, device=device)
-        # In the state spec too: from the observation spec alone, TransformedEnv.reset drops the design without a word.
+        # In the state spec too: with the observation spec only, TransformedEnv.reset silently drops the design.
         self.state_spec = Composite(design=design.clone(), shape=shape, device=device)
         self.action_spec = Bounded(-1, 1, shape=self.simulations.ctrl.shape, dtype=torch.float32, device=device)
         self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32, device=device)
@@ -219,13 +220,13 @@ class MorphEnv(Fleet, DesignedEnv):
         flags = {key: torch.zeros(self.numel(), 1, dtype=torch.bool, device="cpu") for key in DONE_KEYS}
         answer = self._answer(values | flags).clone()
         if chosen is not None:
-            # For rows that are not reset TorchRL answers with the caller's values, and with zeros if there are none.
+            # For rows that are not reset, TorchRL returns the values of the input, and zeros if it has none.
             given.update(answer.select(*values).clone())
         return answer
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         given = tensordict
-        if not self._on_host:  # one transfer there, and one back
+        if not self._on_host:  # one transfer to the CPU, and one back
             given = tensordict.select("action", "design", "_step", *DONE_KEYS, strict=False).to("cpu")
         check_step(given.get("design", None), self._design)
         idle = idle_rows(given, self.batch_size)
@@ -246,7 +247,7 @@ class MorphEnv(Fleet, DesignedEnv):
         return self._answer(values)
 
     def _answer(self, values: dict[str, Tensor]) -> TensorDict:
-        """A row for each run on the environment's device, of tensors on the CPU."""
+        """Make a tensordict ``[K]`` of tensors on the CPU, and move it to the environment's device."""
         if self._on_host:
             return TensorDict(values, self.batch_size, device=self.device)
         return TensorDict(values, self.batch_size, device="cpu").to(self.device)
@@ -256,7 +257,7 @@ class MorphEnv(Fleet, DesignedEnv):
         return self.device is None or self.device.type == "cpu"
 
     def _check_numbers(self) -> None:
-        """Refuse bounds, steps, a scale of the observation or a reward that do not fit the body."""
+        """Refuse design bounds, a frame skip, an observation scale or a reward that do not fit the body."""
         name, size, scale = type(self).__name__, self._observation.shape[-1], self.OBSERVATION_SCALE
         low, high = self.DESIGN_BOUNDS
         if not (0 < low <= 1 <= high < math.inf and low < high):
@@ -275,7 +276,7 @@ class MorphEnv(Fleet, DesignedEnv):
 
 
 def _existing(device: torch.device | str | None) -> torch.device | None:
-    """The device, if this machine has it; torch's default without one, which is none if that is the CPU."""
+    """Check that a device exists; for None, return torch's default device, or None if that is the CPU."""
     if device is None:
         default = torch.get_default_device()
         return None if default.type == "cpu" else default
@@ -283,5 +284,5 @@ def _existing(device: torch.device | str | None) -> torch.device | None:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
-        raise ValueError(f"device {str(device)!r} is not there ({reason}); 'cpu' always is") from error
+        raise ValueError(f"device {str(device)!r} does not exist here ({reason}); 'cpu' always does") from error
     return torch.device(device)

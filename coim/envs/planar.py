@@ -1,7 +1,7 @@
-"""What a body must be for :class:`~coim.envs.morph.MorphEnv`: a robot that runs in the plane of x and z.
+"""Check that a body fits :class:`~coim.envs.morph.MorphEnv`: a robot that runs in the plane of x and z.
 
-The fleet reads a body by position (root x first, then its height, then its pitch), lifts it out of a floor at z = 0 by
-its capsules, and drives motors that take [-1, 1]. Any other body would be simulated without a word, and wrongly.
+The fleet reads the joints by position (root x first, then its height, then its pitch), uses the capsules to lift the
+body out of a floor at z = 0, and drives motors in [-1, 1]. Any other body would silently be simulated wrongly.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ RUNNER = (
 
 
 def check_planar(model: mujoco.MjModel, name: str) -> None:
-    """Refuse a body that is no planar runner.
+    """Refuse a body that is not a planar runner.
 
     Args:
         model: the compiled body.
-        name: of the class, for the sentence.
+        name: name of the class, for the message.
 
     Raises:
-        ValueError: it is something else; the sentence says what is different and what a body must be.
+        ValueError: if it is not; the message says what is different, and what a body must be.
     """
     different = next(_differences(model), None)
     if different is not None:
@@ -35,7 +35,7 @@ def check_planar(model: mujoco.MjModel, name: str) -> None:
 
 
 def _differences(model: mujoco.MjModel) -> Iterator[str]:
-    """What about a body is not planar or not a runner, the most telling first."""
+    """Yield what makes a body differ from a planar runner, the most helpful difference first."""
     yield from _of_joints(model)
     for motor in range(model.nu):
         if (
@@ -61,14 +61,14 @@ def _differences(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _of_joints(model: mujoco.MjModel) -> Iterator[str]:
-    """What about the joints is different; axes are those in the world, in the pose of the start."""
+    """Yield what is different in the joints; axes are in world coordinates, in the start pose."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for place, (wanted, kind, axis) in enumerate(ROOT):
         if place >= model.njnt:
             yield f"has {model.njnt} joints"
         there = model.jnt_type[place] == kind and np.allclose(np.abs(data.xaxis[place] @ axis), 1)
-        # Speed and height are read along the slides, so that their sign counts; a pitch may turn either way.
+        # The slides define the sign of speed and height; the pitch may have either sign.
         if not there or (kind == SLIDE and data.xaxis[place] @ axis < 0):
             yield f"has {_kind(model, data, place)} as joint {place}, not a {wanted}"
     roots = model.jnt_bodyid[: len(ROOT)]

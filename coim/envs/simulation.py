@@ -1,8 +1,8 @@
-"""A fleet of MuJoCo simulations, each with a body of its own, stepped by native threads.
+"""A fleet of MuJoCo simulations, each with its own body, stepped by native threads.
 
 Shapes: K simulations, D design, nq positions, nv velocities, nu motors.
 
-Numpy and MuJoCo only. How a body is built, and what counts as a broken simulation, is decided here and nowhere else.
+This module uses only numpy and MuJoCo. It alone decides how a body is built, and when a simulation is broken.
 
 References:
     Todorov, Erez, Tassa: MuJoCo: A physics engine for model-based control, IROS 2012.
@@ -17,26 +17,26 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 ROOT_X, ROOT_Z, PITCH = 0, 1, 2  # qpos of the root: two slides in m and a hinge in rad
-BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: no working body gets near, and MuJoCo itself complains only from 1e10 on
+BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: far beyond any working body; MuJoCo itself warns only from 1e10 on
 
 
 class Simulations:
-    """K simulations of bodies that differ in their lengths.
+    """K simulations of bodies with different lengths.
 
     Args:
-        drawn: the body as drawn, xi = 1.
+        drawn: the body of the XML file, xi = 1.
 
     Keyword Args:
-        shape_body: turns a body as drawn into the body of a design ``[D]``, in place.
+        shape_body: changes the body at xi = 1 into the body of a design ``[D]``, in place.
         designs: the first designs, ``[K, D]``.
         num_threads: native threads that share the simulations; they do not change the results.
 
     Attributes:
-        qpos: joint positions, ``[K, nq]`` float64. Live, as all arrays here: a write is the state that the next step
-            starts from.
+        qpos: joint positions, ``[K, nq]`` float64. All arrays here are live: the next step starts from the values that
+            are written to them.
         qvel: joint velocities, ``[K, nv]``.
         ctrl: motor commands, ``[K, nu]``.
-        state: everything a simulation carries from step to step, ``[K, n]``: to copy rows is to copy simulations.
+        state: everything that a simulation keeps from step to step, ``[K, n]``; a copy of a row copies a simulation.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Simulations:
         self._batch.set_models(self._models)
         self.state: np.ndarray = self._batch.state
         self.qpos, self.qvel, self.ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-        self._warnings = self._batch.warning[:, :, 1]  # how often each kind of warning came, [K, kinds]
+        self._warnings = self._batch.warning[:, :, 1]  # number of warnings of each kind, [K, kinds]
         # Time, positions and velocities are the first columns of the state.
         moving = mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL
         self._moving = self.state[:, : mujoco.mj_stateSize(self._models[0], int(moving))]
@@ -62,44 +62,44 @@ class Simulations:
         self._silence.logto_file = self._silence.logto_console = False
 
     def body(self, design: np.ndarray) -> mujoco.MjSpec:
-        """The body of a design ``[D]``, ready to be compiled (a third of a millisecond) or drawn."""
+        """Return the body of a design ``[D]``, to compile (a third of a millisecond) or to draw."""
         spec = self._drawn.copy()
         self._shape_body(spec, np.asarray(design, dtype=np.float64))
         return spec
 
     def model(self, row: int) -> mujoco.MjModel:
-        """The compiled body of one simulation, to be read: simulations of one design may share it."""
+        """Return the compiled body of one simulation. Do not change it: simulations of one design may share it."""
         return self._models[row]
 
     def build(self, rows: np.ndarray, designs: np.ndarray) -> None:
-        """Give some simulations new bodies, ``designs [len(rows), D]``. Their states stay as they are.
+        """Give some simulations new bodies, ``designs [len(rows), D]``. Their states do not change.
 
-        Everything that depends on lengths (masses, inertias, bounding volumes, start pose) follows, because each body
-        is compiled from scratch: patching the fields of a model is faster, but half of them are stale if one is
-        forgotten.
+        Each body is compiled from scratch, so that everything that depends on lengths (masses, inertias, bounding
+        volumes, start pose) is right. To change fields of a compiled model is faster, but one forgotten field makes
+        others wrong.
         """
         for row, model in zip(rows, self._compiled(designs)):
             self._models[row] = model
         self._batch.set_models(self._models)
 
     def _compiled(self, designs: np.ndarray) -> list[mujoco.MjModel]:
-        """The body of each design, compiled once for all rows that have it."""
+        """Compile the bodies of the designs, once for all rows with the same design."""
         distinct = {design.tobytes(): design for design in designs}
         models = {key: self.body(design).compile() for key, design in distinct.items()}
         return [models[design.tobytes()] for design in designs]
 
     def start(self, rows: np.ndarray) -> None:
-        """Put some simulations at the start of their bodies: at rest, with no memory of what was before."""
+        """Put some simulations into the start pose of their bodies, at rest, without any state from before."""
         self._batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
 
     def step(self, num_steps: int) -> np.ndarray:
         """Advance all simulations under their ``ctrl``.
 
-        A simulation breaks if MuJoCo warns of it or raises, or if a number in it is not finite or beyond 1e6 (m, rad,
-        m/s, rad/s). It is put back at its start; the others do not notice.
+        A simulation breaks if MuJoCo warns or raises, or if one of its numbers is not finite or beyond 1e6 (m, rad,
+        m/s, rad/s). It is put back into its start pose; the others are not affected.
 
         Returns:
-            Rows of the simulations that broke; almost always there are none.
+            Rows of the simulations that broke, almost always none.
         """
         failed = self._step_silently(num_steps)
         # "not below" instead of "above": a comparison with NaN is false.
@@ -108,14 +108,14 @@ class Simulations:
         return failed
 
     def lift_out_of_floor(self, row: int) -> None:
-        """Raise a robot whose joints were moved so that it stands on the floor rather than in it."""
+        """Lift a robot onto the floor if one of its parts is below it."""
         capsules = self.capsules(row)
         lowest = (np.minimum(capsules[:, 1], capsules[:, 3]) - capsules[:, 4]).min()
         if lowest < 0:
-            self.qpos[row, ROOT_Z] -= lowest  # rootz slides straight up
+            self.qpos[row, ROOT_Z] -= lowest  # rootz is a vertical slide
 
     def capsules(self, row: int) -> np.ndarray:
-        """Where the segments of a planar body are: x and z of both ends and the radius in m, ``[segments, 5]``."""
+        """Return the positions of the segments: x and z of both ends and the radius in m, ``[segments, 5]``."""
         model, data = self._models[row], self._scratch
         data.qpos[:] = self.qpos[row]
         mujoco.mj_kinematics(model, data)
@@ -125,7 +125,7 @@ class Simulations:
         return np.hstack([centre - half * axis, centre + half * axis, radius])
 
     def _step_silently(self, num_steps: int) -> np.ndarray:
-        """Step without MuJoCo's MUJOCO_LOG.TXT in the user's folder; :meth:`step` returns what it would say there."""
+        """Step without writing MUJOCO_LOG.TXT to the user's folder; :meth:`step` returns the broken rows instead."""
         chosen_by_user = mujoco.MjLogConfig.get()
         self._silence.set()
         try:
@@ -137,7 +137,7 @@ class Simulations:
         return np.empty(0, dtype=np.int64)
 
     def _mend(self, failed: np.ndarray) -> np.ndarray:
-        """Find the broken rows and start them again, which clears their warnings too."""
+        """Find the broken rows and start them again; this clears their warnings too."""
         broken = self._warnings.any(axis=1) | ~(np.abs(self._moving).max(axis=1) < BEYOND_PHYSICS)
         broken[failed] = True
         rows = np.flatnonzero(broken)

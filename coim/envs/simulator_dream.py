@@ -1,4 +1,4 @@
-"""The simulator itself as h: a dream without any error of a model.
+"""The simulator as h: a dream without model error.
 
 Shapes: ``*B`` any batch, R rows of the fleet, S observation, A action, D design.
 
@@ -15,19 +15,19 @@ from coim.envs.morph import MorphEnv
 
 
 class SimulatorDynamics:
-    """Next observations from the true physics, in the place of an ensemble in :class:`~coim.WorldModelEnv`.
+    """Next observations from the simulator, as a replacement for the ensemble in :class:`~coim.WorldModelEnv`.
 
-    What goes wrong with an ensemble and not with this one is the model's error; what goes wrong with both is due to
-    what is asked of it, such as a state of one body under the design of another, and to the bootstrapping from there.
+    If learning fails with an ensemble but not with the simulator, the error of the model is the cause. If it fails with
+    both, the cause is the queries, such as a state of one body with the design of another, or the bootstrap from there.
 
     Args:
-        bodies: a fleet of its own, R rows, that is set to the states and designs asked for, R at a time. Its task and
-            its reset noise do not matter.
+        bodies: a separate fleet of R rows, which simulates R states and designs at a time. Its task and its reset noise
+            do not matter.
 
     Note:
-        Nothing is carried from one call to the next. The solver's warm start and the root's x are no part of an
-        observation: a state that was once seen goes on as it did to the precision of float32. A simulation that breaks
-        stays where it was, as in :class:`~coim.envs.morph.MorphEnv`.
+        A call does not depend on earlier calls. An observation does not have the solver's warm start and the root's x:
+        the next observation of a stored state equals the stored one up to the precision of float32. A simulation that
+        breaks keeps its observation, as in :class:`~coim.envs.morph.MorphEnv`.
 
     Example:
         >>> from coim import HopperMorph, WorldModelEnv
@@ -53,7 +53,7 @@ class SimulatorDynamics:
             observation: ``[*B, S]``.
             action: ``[*B, A]``, in [-1, 1].
             design: ``[*B, D]``.
-            generator: not used, the physics draw nothing.
+            generator: not used; the simulator is deterministic.
 
         Returns:
             Next observations ``[*B, S]`` without gradients.
@@ -75,11 +75,11 @@ class SimulatorDynamics:
     def means(
         self, *asked: tuple[Tensor, Tensor, Tensor], generator: torch.Generator | None = None
     ) -> tuple[Tensor, ...]:
-        """Step several sets of (observation, action, design), as :meth:`sample` does: the physics have no spread."""
+        """Step several sets of (observation, action, design), as :meth:`sample` does: there is no randomness."""
         return tuple(self.sample(*one) for one in asked)
 
 
 def _filled_up(rows: Tensor, count: int) -> Tensor:
-    """The last row repeated until there are as many as the fleet has."""
+    """Repeat the last row until there are as many rows as in the fleet."""
     missing = count - len(rows)
     return torch.cat([rows, rows[-1:].expand(missing, -1)]) if missing else rows

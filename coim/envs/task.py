@@ -1,4 +1,4 @@
-"""What the tasks of all bodies have in common: a direction.
+"""The tasks of all bodies: walking forward or backward.
 
 Shapes: *B any batch.
 """
@@ -13,17 +13,17 @@ Task = Literal["forward", "backward"]
 
 
 def speed_along(task: Task, velocity: Tensor) -> Tensor:
-    """The horizontal speed that a task pays for: its sign is turned for walking backward (Fig. 1, second row).
+    """Return the horizontal speed in the direction of a task; backward is Fig. 1, second row.
 
     Args:
         task: ``"forward"`` or ``"backward"``.
-        velocity: of the root along x in m/s, ``[*B]``.
+        velocity: velocity of the root along x in m/s, ``[*B]``.
 
     Returns:
         Speed in the task's direction in m/s, ``[*B]``.
 
     Raises:
-        ValueError: the task is neither.
+        ValueError: if the task is neither.
 
     Example:
         >>> import torch

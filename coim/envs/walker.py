@@ -57,11 +57,10 @@ class WalkerMorph(MorphEnv):
     in m/s and the pitch in rad after the step, as printed.
 
     Note:
-        0.8 m is an absolute height: a design whose torso stands lower can never earn it (2 in 10,000 uniform designs).
+        0.8 m is an absolute height. A body that is too small can never reach it (2 in 10,000 uniform designs).
 
     Keyword Args:
-        observe_root_x: keep the distance travelled, which makes up the paper's 18 state dimensions; Gymnasium leaves it
-            out.
+        observe_root_x: observe the distance travelled, the first of the paper's 18 dimensions; Gymnasium leaves it out.
         num_runs, task, episode_steps, reset_noise, seed, num_threads, device: see :class:`~coim.envs.morph.MorphEnv`.
 
     Example:
@@ -76,10 +75,9 @@ class WalkerMorph(MorphEnv):
     DESIGN_BOUNDS = (0.5, 2.0)
     FRAME_SKIP = 4
     RESET_NOISE = 0.005
-    # Both legs alike; the distance travelled by what a walking body covers, random actions stay within 1 m.
+    # The same for both legs. 5 m is the distance that a walking body covers; random actions stay within 1 m.
     OBSERVATION_SCALE = (5.0, 0.25, 1.5, *[0.9, 0.9, 0.6] * 2, 1.1, 1.3, 8.0, *[9.5, 6.0, 15.0] * 2)
-    # The unit body and four draws from the uniform distribution, kept so that every run starts with the same five (Sec.
-    # 6.1).
+    # The unit body and four fixed draws from the uniform distribution: every run starts with the same five (Sec. 6.1).
     FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]] = (
         (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
         (1.44, 1.85, 1.66, 0.84, 0.95, 1.81, 0.51),
@@ -87,7 +85,7 @@ class WalkerMorph(MorphEnv):
         (1.26, 1.33, 1.99, 1.69, 1.43, 1.98, 0.82),
         (0.74, 1.42, 0.57, 0.55, 1.27, 1.2, 1.88),
     )
-    STANDING_HEIGHT = 0.8  # m; below it neither speed nor survival is paid
+    STANDING_HEIGHT = 0.8  # m; below it, the reward has no terms for speed and survival
     PITCH_COST = 0.1  # 1/rad
 
     def __init__(
@@ -114,7 +112,7 @@ class WalkerMorph(MorphEnv):
         )
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
-        """Set every length; the torso starts at the height at which the longer leg stands."""
+        """Set all lengths; the torso starts at the height of the longer leg."""
         legs = {"": design[1:4], "_left": design[4:7]}
         for side, scales in legs.items():
             thigh, knee, foot = scales * (THIGH, KNEE, FOOT)
@@ -141,23 +139,23 @@ class WalkerMorph(MorphEnv):
 
 
 def shape_torso(spec: mujoco.MjSpec, length: float, *, height: float) -> None:
-    """Set the torso's length and the height of its centre at the start, both in m; the legs hang from its lower end."""
+    """Set the length of the torso and the height of its centre at the start, in m; the legs join its lower end."""
     torso = spec.body("torso")
     torso.pos = [0.0, 0.0, height]
     for name in ("rootx", "rootz"):
         spec.joint(name).pos = [0.0, 0.0, -height]
-    spec.joint("rootz").ref = height  # so that qpos[1] is the height above the floor
+    spec.joint("rootz").ref = height  # then qpos[1] is the height above the floor
     _set_half_length(spec.geom("torso"), length / 2)
     for thigh in torso.bodies:
         thigh.pos = [0.0, 0.0, -length / 2]
 
 
 def shape_leg(spec: mujoco.MjSpec, side: str, *, thigh: float, shank: float, foot: float, toe: float) -> None:
-    """Set the lengths of one leg in m; ``toe`` is how far the foot's tip lies before the ankle joint.
+    """Set the lengths of one leg in m.
 
     Args:
         spec: the body.
-        side: what the names of this leg's parts end in.
+        side: suffix of the names of this leg's parts.
         thigh: from hip to knee.
         shank: from knee to the end of the shank; the foot's axis lies 0.1 m lower.
         foot: between the centres of the foot's round ends.

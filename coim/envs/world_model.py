@@ -1,4 +1,4 @@
-"""The learned dynamics driven as an environment: the dream.
+"""The learned dynamics as an environment: the dream.
 
 Shapes: ``*B`` any batch, ``S`` state, ``A`` action, ``D`` design.
 
@@ -29,7 +29,7 @@ STATE_KEYS = ("observation", "design")
 
 
 class Dynamics(Protocol):
-    """What :class:`WorldModelEnv` asks of a model of the dynamics, such as :class:`coim.GaussianEnsemble`."""
+    """A model of the dynamics for :class:`WorldModelEnv`, such as :class:`coim.GaussianEnsemble`."""
 
     def sample(
         self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
@@ -39,42 +39,43 @@ class Dynamics(Protocol):
 
 @runtime_checkable
 class AnchoredDynamics(Dynamics, Protocol):
-    """A model that can also say what another state, action or design changes, for `WorldModelEnv.advance_beside`."""
+    """A model that can also compare several states, actions and designs, for `WorldModelEnv.advance_beside`."""
 
     def means(
         self, *asked: tuple[Tensor, Tensor, Tensor], generator: torch.Generator | None = None
     ) -> tuple[Tensor, ...]:
-        """Expect next observations ``[*B, S]`` of several (observation, action, design) by one draw of the model."""
+        """Return mean next observations ``[*B, S]`` of several (observation, action, design), by the same member."""
 
 
 class WorldModelEnv(DesignedEnv):
-    """Not TorchRL's ``WorldModelEnv``: this one steps a learned transition model over (observation, action, design).
+    """A learned transition model over (observation, action, design) as an environment; not TorchRL's ``WorldModelEnv``.
 
-    A step asks the model for the next observation and the real environment's reward function for the reward; the design
-    is carried along. Nothing terminates and nothing is truncated, as in the real episodes (Sec. 6.1); a horizon is
-    TorchRL's ``StepCounter``, or the ``max_steps`` of a rollout.
+    A step gets the next observation from the model, and the reward from the real environment's reward function. The
+    design stays. No row is terminated or truncated, as in the real episodes (Sec. 6.1). For a horizon, use TorchRL's
+    ``StepCounter``, or the ``max_steps`` of a rollout.
 
-    A reset takes the start states from its tensordict, ``{"observation": [*B, S], "design": [*B, D]}``. Without them it
-    goes back to the last ones given; before any were given to a made-up start: standard-normal observations and uniform
-    designs, good for checking specs and little else.
+    A reset takes the start states from its input, ``{"observation": [*B, S], "design": [*B, D]}``. Without them, it
+    takes those of the last reset that had some. Before that, it draws standard-normal observations and uniform designs,
+    which are useful only to check specs.
 
-    The dream itself steps the states that its input holds, ``dream.step(td)``. Behind a transform it steps its own,
-    which no transform has touched, as the bodies do; a ``design`` in the input that is not its own is then refused.
+    ``dream.step(td)`` steps the states of its input. Inside of a transform, the dream steps its own states, without the
+    transform, as the bodies do; it then refuses a ``design`` in the input that is not its own.
 
     Args:
-        ensemble: the model; its ``sample`` gives next observations.
-        env: the real environment: gives the specs, ``design_spec`` and ``reward_fn``; it is not stepped. A bare one:
-            transforms are put around the dream.
-        batch_size: of the dream, ``[*B]``: free to differ from ``env``'s, but a fleet of models has its run axis last.
-        seed: of the dream's own random numbers (TS1, noise, made-up starts). Drawn from torch if unset.
+        ensemble: the model; its ``sample`` returns next observations.
+        env: the real environment, without transforms (put them around the dream). It gives the specs, ``design_spec``
+            and ``reward_fn``, and is not stepped.
+        batch_size: batch size of the dream, ``[*B]``. It may differ from that of ``env``; for a fleet of models, the
+            last dimension is the run axis.
+        seed: seed of the dream's random numbers (TS1, noise, drawn starts); None draws one from torch.
 
     Attributes:
-        rng: the dream's own generator; its state is all that a dream carries from one call of `advance` to the next.
-        clearance: of ``env``'s bodies, see :meth:`~coim.envs.morph.MorphEnv.clearance`; None if these have none.
-        transfer: of ``env``'s bodies, see :meth:`~coim.envs.morph.MorphEnv.transfer`; None if these have none.
+        rng: the dream's generator; its state is all that a dream keeps from one call of `advance` to the next.
+        clearance: see :meth:`~coim.envs.morph.MorphEnv.clearance`; None if the bodies of ``env`` have none.
+        transfer: see :meth:`~coim.envs.morph.MorphEnv.transfer`; None if the bodies of ``env`` have none.
 
     Raises:
-        TypeError: if ``env`` is a TransformedEnv, or no body: a `SerialEnv`, an environment without a design.
+        TypeError: if ``env`` is a TransformedEnv, or is not a body, such as a `SerialEnv`.
         ValueError: if a start state has an entry that is not finite, or a design that leaves the bounds, or if the
             reward of ``env`` is not ``[*B, 1]``.
 
@@ -90,13 +91,13 @@ class WorldModelEnv(DesignedEnv):
     def __init__(self, ensemble: Dynamics, env: EnvBase, *, batch_size: Sequence[int], seed: int | None = None) -> None:
         if isinstance(env, TransformedEnv):
             raise TypeError(
-                "model and reward are of what the bodies themselves observe: pass env.base_env to the dream, and put "
-                "the transforms around it, TransformedEnv(dream, ...)"
+                "model and reward need the observations of the bodies without transforms: pass env.base_env to the "
+                "dream, and put the transforms around it, TransformedEnv(dream, ...)"
             )
         if isinstance(env, BatchedEnvBase) or not (hasattr(env, "reward_fn") and hasattr(env, "design_spec")):
             raise TypeError(
-                f"a {type(env).__name__} has no reward_fn and design_spec of its own; pass one of the bodies that are "
-                "dreamt of, such as a MorphEnv, and give the dream any batch_size"
+                f"a {type(env).__name__} has no reward_fn and design_spec of its own; pass one of its bodies, "
+                "such as a MorphEnv, and give the dream any batch_size"
             )
         super().__init__(device=env.device, batch_size=torch.Size(batch_size))
         self.ensemble = ensemble
@@ -118,18 +119,18 @@ class WorldModelEnv(DesignedEnv):
         self.rng = torch.Generator(self.device or "cpu")
         self._set_seed(int(torch.randint(2**31, (), device="cpu")) if seed is None else seed)
         self._start = TensorDict({}, self.batch_size, device=self.device)
-        self._state: TensorDict | None = None  # where it is, before any transform
+        self._state: TensorDict | None = None  # the current states, without transforms
 
     def advance(
         self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Dream one step on tensors of any batch size; gradients flow.
+        """Compute one step of the dream on tensors of any batch size; differentiable.
 
         Args:
             observation: ``[*B, S]``.
             action: ``[*B, A]``, in [-1, 1].
             design: ``[*B, D]``.
-            generator: of random numbers; default: the dream's own.
+            generator: generator of the random numbers; None takes the dream's own.
 
         Returns:
             Next observation ``[*B, S]`` and reward ``[*B, 1]``.
@@ -147,34 +148,34 @@ class WorldModelEnv(DesignedEnv):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Dream one step anchored at a real one: its outcome, and the difference that the model expects.
+        """Compute one step anchored at a real transition: its outcome, plus the difference that the model predicts.
 
-        ``s'_g = s' + h(s_g, a_g, xi_g) - h(s, a, xi)`` for a real transition (s, a, s') of body xi, by one member's
-        mean: what the model does wrong on both sides alike drops out (CSE, arXiv:2507.07348).
+        ``s'_g = s' + h(s_g, a_g, xi_g) - h(s, a, xi)`` for a real transition (s, a, s') of body xi, by the mean of one
+        member. Errors that are the same in both predictions cancel (CSE, arXiv:2507.07348).
 
         Args:
             real: transitions ``[*B]`` with ``observation``, ``action``, ``design`` and ``("next", "observation")``.
             observation: s_g ``[*B, S]``.
             action: a_g ``[*B, A]``, in [-1, 1].
             design: xi_g ``[*B, D]``.
-            generator: of random numbers; default: the dream's own.
+            generator: generator of the random numbers; None takes the dream's own.
 
         Returns:
-            Next observation ``[*B, S]`` with its angles in (-pi, pi], and reward ``[*B, 1]``. Where nothing differs
-            from the real transition, its next observation to the last bit.
+            Next observation ``[*B, S]`` with its angles in (-pi, pi], and reward ``[*B, 1]``. If nothing differs from
+            the real transition, the result is its next observation to the last bit.
 
         Raises:
             TypeError: if the model has no ``means``.
         """
         if not isinstance(self.ensemble, AnchoredDynamics):
             raise TypeError(
-                f"a {type(self.ensemble).__name__} has no means() to anchor with; give it one as AnchoredDynamics has "
-                "it, or imagine without anchoring"
+                f"a {type(self.ensemble).__name__} has no means() to anchor with; add it as in AnchoredDynamics, or "
+                "imagine without anchoring"
             )
-        # h predicts a next observation in raw units, also where the network's target is the change. So the difference
-        # holds all that s_g differs by, and the height by which the root was moved is in it: with Delta the change,
+        # h is a next observation in raw units, also if the network predicts the change Delta. The difference therefore
+        # already has s_g - s, the height by which the root was moved included:
         #   s' + h(s_g, ...) - h(s, ...) = s' + (s_g + Delta_g) - (s + Delta) = s_g + (s' - s) + (Delta_g - Delta).
-        # Adding s_g - s once more would lift the root twice. Where h is exact, h(s, ...) = s' and h(s_g, ...) is left.
+        # Adding s_g - s again would lift the root twice. If h is exact, h(s, ...) = s', and the result is h(s_g, ...).
         here = tuple(real[key] for key in ("observation", "action", "design"))
         there, expected = self.ensemble.means(
             (observation, action, design), here, generator=self.rng if generator is None else generator
@@ -185,7 +186,7 @@ class WorldModelEnv(DesignedEnv):
         return next_observation, self.reward_fn(observation, action, next_observation, design)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Step the states that the tensordict holds, ``observation`` and ``design``; its own where one is missing."""
+        """Step the ``observation`` and ``design`` of the input; the dream's own ones if they are missing."""
         self._assert_tensordict_shape(tensordict)
         given = self._as_specified(tensordict)
         own = {} if set(STATE_KEYS) <= set(given.keys()) else self._present()
@@ -196,7 +197,7 @@ class WorldModelEnv(DesignedEnv):
         observation, design = (self._present()[key] for key in STATE_KEYS)
         check_step(tensordict.get("design", None), design)
         seen = tensordict.get("observation", None)
-        if seen is not None and not seen.requires_grad:  # the caller has cut the gradient: no graph grows in here
+        if seen is not None and not seen.requires_grad:  # the input has no gradient: keep no graph
             observation = observation.detach()
         action = tensordict["action"].to(observation.dtype)
         next_observation, reward = self.advance(observation, action, design)
@@ -204,7 +205,7 @@ class WorldModelEnv(DesignedEnv):
         if idle is not None:
             next_observation = torch.where(idle.unsqueeze(-1), observation, next_observation)
         after = TensorDict({"observation": next_observation, "design": design}, self.batch_size, device=self.device)
-        self._state = after.clone()  # ours; what is handed out may be written to
+        self._state = after.clone()  # our own copy: the caller may write to the returned one
         answer = self.full_done_spec.zero().update(after).set("reward", reward)
         if idle is not None:
             leave_idle(answer, tensordict, idle)
@@ -218,19 +219,19 @@ class WorldModelEnv(DesignedEnv):
             given = self._as_specified(tensordict)
             which = tensordict.get("_reset", everywhere).reshape(self.batch_size)
             self._check_start(given, which)
-            # Rows that are not reset keep the start that they had; EnvBase.reset leaves their state as it is.
+            # Rows that are not reset keep their start; EnvBase.reset does not change their state.
             kept = given if which.all() else self._begun().select(*given.keys())
             self._start.update(given.where(which, kept))
         self._start = self._begun()
         self._state = self._start.clone() if which.all() else self._start.where(which, self._present())
         answer = self.full_done_spec.zero().update(self._state.clone())
         if tensordict is not None and "_reset" in tensordict:
-            # For rows that are not reset TorchRL answers with the caller's values, and with zeros if there are none.
+            # For rows that are not reset, TorchRL returns the values of the input, and zeros if it has none.
             tensordict.update(self._state.exclude(*tensordict.keys()).clone())
         return answer
 
     def to(self, device: torch.device | str) -> Self:
-        """Move the dream, its model and its random numbers, which are others on another kind of device."""
+        """Move the dream, its model and its generator; another kind of device draws other numbers."""
         super().to(device)
         state, self.rng = self.rng.get_state(), torch.Generator(self.device or "cpu")
         restore_generator(self.rng, state)
@@ -239,7 +240,7 @@ class WorldModelEnv(DesignedEnv):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """All of it for pickle and deepcopy; the states without the graph that led to them."""
+        """Return the state for pickle and deepcopy, without the autograd graph of the states."""
         state = super().__getstate__() | {
             "rng": (self.rng.device, self.rng.get_state()),
             "_start": self._start.detach(),
@@ -253,12 +254,12 @@ class WorldModelEnv(DesignedEnv):
         restore_generator(self.rng, generator_state)
 
     def _as_specified(self, given: TensorDictBase) -> TensorDict:
-        """The states in a tensordict, as far as there are some, in the dtypes of the specs; gradients flow."""
+        """Return the states that a tensordict has, in the dtypes of the specs; differentiable."""
         states = given.select(*STATE_KEYS, strict=False).items()
         return TensorDict({key: state.to(self.observation_spec[key].dtype) for key, state in states}, self.batch_size)
 
     def _present(self) -> TensorDict:
-        """Where the rows are: at their starts, before any reset."""
+        """Return the current states of the rows; before any reset, their starts."""
         if self._state is None:
             self._state = self._begun().clone()
         return self._state
@@ -268,18 +269,18 @@ class WorldModelEnv(DesignedEnv):
             self.rng.manual_seed(seed)
 
     def _make_specs(self, env: EnvBase) -> None:
-        """Give each of the real environment's specs the dream's batch size."""
+        """Copy the real environment's specs, with the dream's batch size."""
         single = env.full_observation_spec_unbatched
         observed = Composite({key: single[key] for key in ("observation", "design")})
         self.observation_spec = observed.expand(*self.batch_size)
-        # Both must also be state: only then do transforms and rollouts hand them to reset and step.
+        # Both must also be in the state spec: otherwise transforms and rollouts do not pass them to reset and step.
         self.state_spec = observed.clone().expand(*self.batch_size)
         self.action_spec = env.full_action_spec_unbatched.expand(*self.batch_size)
         self.reward_spec = env.full_reward_spec_unbatched.expand(*self.batch_size)
         self.done_spec = env.full_done_spec_unbatched.expand(*self.batch_size)
 
     def _begun(self) -> TensorDict:
-        """The starts of all rows: the last ones given, and made-up ones for those who gave none."""
+        """Return the starts of all rows: the last ones given, or drawn ones if none were given."""
         if len(self._start.keys()) == 2:
             return self._start
         low, high = self.design_spec.space.low, self.design_spec.space.high
@@ -290,7 +291,7 @@ class WorldModelEnv(DesignedEnv):
         return TensorDict(start, self.batch_size, device=self.device).update(self._start)
 
     def _check_start(self, start: TensorDictBase, which: Tensor) -> None:
-        """Say which entry of a start cannot be dreamt from, in the rows that are reset."""
+        """Refuse starts of a wrong shape, not finite, or with a design out of bounds, in the rows to reset."""
         for key, value in start.items():
             if value.shape != self.observation_spec[key].shape:
                 raise ValueError(

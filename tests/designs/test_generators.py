@@ -61,7 +61,7 @@ def test_rows_of_a_batch_get_draws_of_their_own(generator: NoisyDesigns | Random
 def test_bad_generators_say_what_is_wrong() -> None:
     with pytest.raises(ValueError, match=r"sigma is -1"):
         NoisyDesigns(SPEC, sigma=-1)
-    with pytest.raises(ValueError, match=r"not the 6 entries"):
+    with pytest.raises(ValueError, match=r"does not have the 6 entries"):
         RandomDesigns(SPEC)(torch.ones(3, 4))
     with pytest.raises(ValueError, match=r"env\.design_spec"):
         RandomDesigns(SPEC.expand(3, 6))

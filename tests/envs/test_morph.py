@@ -364,7 +364,7 @@ def test_capsules_show_the_body_of_the_row():
         ({"reset_noise": -0.1}, "reset_noise -0.1 is not a finite number of at least 0"),
         ({"reset_noise": math.nan}, "reset_noise nan"),
         ({"task": "sideways"}, "unknown task 'sideways'; choose 'forward' or 'backward'"),
-        ({"device": "cuda:99"}, "device 'cuda:99' is not there"),
+        ({"device": "cuda:99"}, "device 'cuda:99' does not exist here"),
     ],
 )
 @BODIES
