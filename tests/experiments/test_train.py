@@ -68,7 +68,7 @@ def test_what_was_measured_while_learning_has_a_row_for_each_run_and_episode(tmp
     ]
     losses = {f"{who}/{what}" for who in ("individual", "population") for what in ("loss_actor", "loss_qvalue")}
     parts = {"collect", "imagine", "train individual", "train population", "train model", "evaluate", "episode"}
-    measured = {"model_error", "model/loss_dynamics", "individual/entropy", "population/entropy"} | losses
+    measured = {"impossible", "model_error", "model/loss_dynamics", "individual/entropy", "population/entropy"} | losses
     assert rows[0].keys() == {"run", "design", "episode", "broken", "diverged"} | measured | {
         f"seconds/{part}" for part in parts
     }
@@ -188,6 +188,25 @@ def test_the_simulator_imagines_and_no_model_is_learnt(tmp_path: Path) -> None:
     # Paired: until the population has learnt from what was imagined, the runs are the same.
     assert ours[0]["return"] == theirs[0]["return"]
     assert ours[1]["return"] != theirs[1]["return"]
+
+
+def test_impossible_pairs_are_counted_in_the_tables_and_matched_states_have_none(tmp_path: Path) -> None:
+    shares = {}
+    for states in ("stored", "matched"):
+        how = ("--designs", "random", "--imagined-states", states, "--value-states", states)
+        run(tmp_path / states, *how, "--num-designs", "4", "--quiet")
+        shares[states] = [float(row["impossible"]) for row in read(tmp_path / states / "metrics.csv")]
+    assert shares["matched"] == [0] * 4
+    assert max(shares["stored"]) > 0
+
+
+def test_a_governed_run_whose_model_has_learnt_too_little_is_the_baseline(tmp_path: Path) -> None:
+    how = ("--designs", "random", "--imagined-states", "matched", "--anchored", "--governed")
+    run(tmp_path / "governed", *how, "--num-designs", "3", "--quiet")
+    run(tmp_path / "none", "--designs", "none", "--num-designs", "3", "--quiet")
+    ours, theirs = (read(tmp_path / name / "evaluations.csv") for name in ("governed", "none"))
+    assert [row["return"] for row in ours] == [row["return"] for row in theirs]
+    assert [float(row["imagined_share"]) for row in read(tmp_path / "governed" / "metrics.csv")] == [0, 0, 0]
 
 
 def test_a_fixed_body_is_marked_as_such(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ if TYPE_CHECKING:
 
 SWARM = ("num_particles", "num_iterations", "swarm_bounds")
 MODEL = ("num_members", "model_cells", "model_lr", "weight_decay", "predict", "model_updates")
-IMAGINATION = ("dream", "sigma", "imagined_share", "individual_imagined_share", "mix", *MODEL)
+ROWS = ("mix", "imagined_states", "imagined_actions", "anchored", "governed")
+IMAGINATION = ("dream", "sigma", "imagined_share", "individual_imagined_share", *ROWS, *MODEL)
 # What has no effect, when, and the setting that decides it.
 RULES: tuple[tuple[tuple[str, ...], Callable[[Settings], bool], str], ...] = (
     (("search", *SWARM), lambda settings: settings.bodies != "search", "bodies"),
@@ -19,7 +20,7 @@ RULES: tuple[tuple[tuple[str, ...], Callable[[Settings], bool], str], ...] = (
     (("sigma",), lambda settings: settings.designs != "noisy", "designs"),
     (MODEL, lambda settings: settings.dream == "simulator", "dream"),
     (
-        ("sigma", "mix"),
+        ("sigma", *ROWS),
         lambda settings: not (settings.imagined_share or settings.individual_imagined_share),
         "imagined_share",
     ),

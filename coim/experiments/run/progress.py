@@ -30,7 +30,7 @@ class Progress:
         num_designs: M.
         forecast: of the time left.
         updates: network updates after each episode, for the speed.
-        imagined_share: of a population batch.
+        imagined_share: of a population batch; a run that is governed says its own in each episode.
         best: return of each run on the present design before, ``[K]``, if there is one.
         stream: where to write; None takes standard output.
         quiet: write nothing.
@@ -92,7 +92,8 @@ class Progress:
         mean_error = "-" if error is None else f"{float(error.nanmean()):.3f}"
         speed = f"{self._updates / event.seconds['episode']:.0f}"
         left = _clock(self._forecast.seconds_left)
-        share = f"{self._imagined_share:.0%}"
+        governed = event.metrics.get("imagined_share")
+        share = f"{self._imagined_share if governed is None else float(governed.nanmean()):.0%}"
         long = [
             f"design {design}",
             f"episode {episode}",

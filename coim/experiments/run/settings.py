@@ -75,6 +75,16 @@ class Settings:
     """Share of a population batch that is imagined (Sec. 5)."""
     individual_imagined_share: float = 0.0
     """Share of an individual batch that is imagined (0 as in Sec. 5; Algorithm 1 cites Eq. 7-8 for it too)."""
+    imagined_states: Literal["stored", "matched"] = "stored"
+    """What a state is under another design: as it was stored (the paper's), or with the root moved by what the legs
+    differ in, without pairs that no body can be in."""
+    imagined_actions: Literal["fresh", "replayed"] = "fresh"
+    """Actions of imagined rows: fresh ones of the population's policy (the paper's), or those of the replay."""
+    anchored: bool = False
+    """Imagine what another design and action change of a real transition, instead of the whole next observation."""
+    governed: bool = False
+    """Take the imagined shares as the most that the model can earn, by its errors on episodes that it has not learnt
+    from. Where it earns nothing, the run is the model-free baseline."""
     mix: Literal["batch", "sum"] = "batch"
     """batch: one mean over real and imagined rows (Sec. 5). sum: the two expectations of Eq. 7-8 as printed."""
     num_members: int = 3
@@ -99,6 +109,10 @@ class Settings:
     """What becomes of a particle that leaves the bounds: clipped, or back in on the other side (the predecessor's)."""
     num_start_states: int = 36
     """Start states that Eq. 5 averages over."""
+    value_states: Literal["stored", "matched"] = "stored"
+    """What a state is under the design that Eq. 5 asks about: as for imagined_states."""
+    value_over: Literal["start", "visited"] = "start"
+    """States that Eq. 5 averages over: those that episodes start with (the paper's), or any that were visited."""
 
     # -- this machine -------------------------------------------------------------------------------------------------
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -145,7 +159,8 @@ QUICK = Settings(
 # What a machine may not have on which a run is gone on with. Its numbers differ from there, within rounding at first.
 ELSEWHERE = ("device", "replay_device", "compile")
 # Settings that came later, with a default that is what all runs had before; these may be missing in a run's folder.
-LATER = {"replay_device", "products"}
+LATER = {"replay_device", "products", "value_states", "value_over"}
+LATER |= {"imagined_states", "imagined_actions", "anchored", "governed"}
 # What the parts of a run refuse in their own words, or not at all; here by the option's name and before there is a run.
 ALLOWED: dict[Interval, tuple[str, ...]] = {
     Interval(1): (
@@ -208,6 +223,11 @@ def check(settings: Settings, *, called: Callable[[str], str] = str) -> None:
         raise ValueError(
             f"{called('dream')} simulator has nothing to imagine with {called('designs')} none; take known, noisy or "
             "random"
+        )
+    if settings.dream == "simulator" and settings.governed:
+        raise ValueError(
+            f"{called('governed')} has no errors to go by with {called('dream')} simulator, which makes none; leave "
+            "one of them out"
         )
     batch_parts(settings.batch_size, imagined=settings.imagined_share)
     batch_parts(settings.batch_size, imagined=settings.individual_imagined_share, other=settings.individual_mix)

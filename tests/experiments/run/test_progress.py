@@ -86,6 +86,15 @@ def test_the_third_episode_says_on_a_line_of_its_own_how_long_the_run_takes(stre
     assert at == 2  # after two episodes, before the third
 
 
+def test_a_governed_run_says_what_share_it_has_earned() -> None:
+    stream = io.StringIO()
+    progress = Progress(num_designs=1, forecast=Forecast(Work(9, 0, 30)), updates=30, imagined_share=0.2, stream=stream)
+    event = episode(0, 0, [1.0, 2.0])
+    event.metrics["imagined_share"] = torch.tensor([0.0, 0.1])
+    progress.show(event)
+    assert "imagined 5%" in stream.getvalue()
+
+
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
 def test_quiet_is_quiet(stream: io.StringIO) -> None:
     assert show_two(stream, quiet=True) == ""

@@ -84,6 +84,15 @@ def test_no_number_is_without_a_limit() -> None:
             "error: --dream simulator has nothing to imagine with --designs none; take known, noisy or random\n",
         ),
         (
+            ["--dream", "simulator", "--governed"],
+            "error: --governed has no errors to go by with --dream simulator, which makes none; leave one of them "
+            "out\n",
+        ),
+        (
+            ["--designs", "none", "--anchored"],
+            "error: --anchored has no effect with --designs none; leave it out\n",
+        ),
+        (
             ["--search", "gradient", "--num-particles", "700"],
             "error: --num-particles has no effect with --search gradient; leave it out\n",
         ),
