@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from coim.experiments.figures.figure import Plot
 from coim.experiments.study.ledger import Entry, State, in_csv
 from coim.experiments.study.runs import parts_of
 
@@ -84,3 +85,10 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[obje
 def read_table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def check_words(plots: Iterable[Plot]) -> None:
+    """Captions that a reader takes in at a glance, and tables that fit on a page."""
+    for plot in plots:
+        assert len(plot.caption.split()) <= 60, plot.caption
+        assert all(len(row) <= 10 for row in plot.table), plot.name

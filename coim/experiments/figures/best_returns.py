@@ -25,11 +25,16 @@ PAPER = {
 STATISTICS: dict[str, Statistic] = {"mean": mean, "IQM": iqm}
 PANEL = (3.6, 2.3)  # inches
 CAPTION = (
-    "Best return of each design in the order of building: the highest undiscounted return of the deterministic policy "
-    "over the evaluation episodes on it. After the first designs, which are given, those that maximise Q and random "
-    "ones take turns, unless the arm says otherwise. Faint: single runs. Strong: mean and interquartile mean (IQM) of "
-    f"those that have reached the design. Bands: pointwise 95 % intervals of the bootstrap over runs ({RESAMPLES} "
-    "resamples, within environment, task and arm). "
+    "Best return of each design, in the order of building. Faint: single runs. Strong: their mean, or interquartile "
+    "mean (IQM). Bands: pointwise 95 % bootstrap intervals over runs."
+)
+NOTES = (
+    "The best return of a design is the highest undiscounted return of the deterministic policy over the evaluation "
+    "episodes on it.",
+    "The first designs are given. After them, designs that maximise Q and random designs take turns, unless the arm "
+    "says otherwise.",
+    "A mean is over the runs that have reached the design. Its interval is a percentile bootstrap within environment, "
+    f"task and arm ({RESAMPLES} resamples).",
 )
 
 
@@ -77,12 +82,7 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
     if any(run.diverged for run in runs.found if run.arm in drawn):
         entries.append(Line2D([], [], marker="x", color=GREY, linestyle="", label="diverged after this design"))
     put_legend(figure, entries)
-    return Plot(name=name, figure=figure, rows=rows, caption=caption_of(drawn) + runs.in_words(arms, counted=True))
-
-
-def caption_of(arms: Sequence[str]) -> str:
-    """What is seen of these arms."""
-    return f"{CAPTION}Arms: {'; '.join(f'{arm} {arm_named(arm).words}' for arm in arms)}. "
+    return Plot(name=name, figure=figure, rows=rows, caption=CAPTION, notes=(*NOTES, runs.in_words(arms, counted=True)))
 
 
 def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:

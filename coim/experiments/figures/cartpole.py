@@ -80,12 +80,16 @@ def plots(study: Path) -> Iterator[Plot]:
         ]
     grid[0].set(ylabel="mass of the pole (kg)")
     caption = (
-        "Acceleration of a cart-pole's cart against length and mass of its pole, from its equations, in three states "
-        "(angle and angular velocity of the pole, force on the cart); for a pole at rest its length makes no "
-        "difference. Numbers on lines: m/s²; each panel has colours of its own. The magenta circle is Gymnasium's "
-        "body, 1 m and 0.1 kg, on a cart of 1 kg."
+        "Acceleration of the cart of a cart-pole against length and mass of its pole, by the equations of motion, in "
+        "three states (angle and angular velocity of the pole, force on the cart). Numbers on lines: m/s². Magenta "
+        "circle: the body of Gymnasium."
     )
-    yield Plot(name="figure_4c_cartpole", figure=figure, rows=rows, caption=caption)
+    notes = (
+        "Gymnasium's body has a pole of 1 m and 0.1 kg on a cart of 1 kg.",
+        "Each panel has a colour scale of its own.",
+        "For a pole at rest its length makes no difference.",
+    )
+    yield Plot(name="figure_4c_cartpole", figure=figure, rows=rows, caption=caption, notes=notes)
 
 
 def draw(axes: Axes, lengths: np.ndarray, masses: np.ndarray, acceleration: np.ndarray) -> None:

@@ -39,8 +39,8 @@ def plots(study: Path) -> Iterator[Plot]:
         yield missing(STEM, f"No model was looked into at the end of its run: {line}")
     for kind, (folder, *others) in found.items():
         name, rows = name_of(STEM, kind, found), read_cells(folder / FILE, LAYOUT)
-        caption = describe(kind, rows) + " " + told_of(folder, others, study)
-        yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption)
+        notes = (*notes_on(rows), told_of(folder, others, study))
+        yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption(kind), notes=notes, table=medians(rows))
 
 
 def drawn(rows: Sequence[Row]) -> Figure:
@@ -94,27 +94,41 @@ def handles() -> list[Line2D | Patch]:
     ]
 
 
-def describe(kind: Kind, rows: Sequence[Row]) -> str:
-    """What is seen, and how far the models are from the simulator where the state is possible."""
-    grid = [row for row in rows if row["point"] == "grid"]
-    deep = np.array([float(row["depth"]) > IN_THE_FLOOR for row in grid])
-    change = {source: np.array([float(row[f"normalised/{source}"]) for row in grid]) for source in SOURCES}
-    medians = []
-    for words, chosen in (("possible", ~deep), ("impossible", deep)):
-        if chosen.any():
-            told = ", ".join(f"{source} {np.nanmedian(values[chosen]):.3g}" for source, values in change.items())
-            medians.append(f"where the state is {words}: {told}")
-    shares = ", ".join(f"{float(rows[0][key]):.0%}" for key in ("share_1", "share_2"))
+def caption(kind: Kind) -> str:
+    """What is drawn."""
     return (
-        f"Squared change of the next state on {kind.environment}, {kind.task}, {kind.designs} designs, when the design "
-        "alone changes, for stored states and actions drawn at random among those whose plane has an area within the "
-        "bounds. The axes are the first two principal components of the designs tried, in scale factors "
-        f"({shares} of their variance), drawn through the state's own design; white is out of bounds. Hatched: more "
-        f"than {IN_THE_FLOOR * 100:.0f} cm of the body would be in the floor. Medians {'; '.join(medians)}."
+        f"Squared change of the next state when only the design changes, for stored states and actions: "
+        f"{kind.environment}, {kind.task}, {kind.designs} designs. Axes: the first two principal components of the "
+        "designs tried, through the state's own design. White: out of bounds. Hatched: the body would be in the floor."
     )
 
 
+def notes_on(rows: Sequence[Row]) -> list[str]:
+    """How states and planes were chosen."""
+    shares = " and ".join(f"{float(rows[0][key]):.0%}" for key in ("share_1", "share_2"))
+    return [
+        "States and actions are drawn at random among those whose plane has an area within the bounds.",
+        f"The two components are in scale factors and hold {shares} of the variance of the designs tried.",
+        f"A state is impossible where more than {IN_THE_FLOOR * 100:.0f} cm of the body would be in the floor.",
+        "The table has the medians over the points of all planes, in variances of one-step changes.",
+    ]
+
+
+def medians(rows: Sequence[Row]) -> list[dict[str, object]]:
+    """Median change by each source, where the state is possible and where it is not."""
+    grid = [row for row in rows if row["point"] == "grid"]
+    deep = np.array([float(row["depth"]) > IN_THE_FLOOR for row in grid])
+    change = {
+        title: np.array([float(row[f"normalised/{source}"]) for row in grid]) for source, title in SOURCES.items()
+    }
+    return [
+        {"state": words} | {title: float(np.nanmedian(values[chosen])) for title, values in change.items()}
+        for words, chosen in (("possible", ~deep), ("impossible", deep))
+        if chosen.any()
+    ]
+
+
 def told_of(folder: Path, others: Sequence[Path], study: Path) -> str:
-    """Whose models these are, and which runs are not drawn."""
+    """Which run's models these are, and which runs are not drawn."""
     first, *rest = (path.relative_to(study).as_posix() for path in (folder, *others))
-    return f"Of {first}" + (f", the first by name; not drawn: {', '.join(rest)}." if rest else ".")
+    return f"The models are those of {first}" + (f", the first by name. Not drawn: {', '.join(rest)}." if rest else ".")

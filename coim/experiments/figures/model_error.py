@@ -69,7 +69,14 @@ def plots(study: Path) -> Iterator[Plot]:
         if not rows:
             yield missing(name, f"There is no measurement yet in {' and '.join(str(x / FILE) for x in folders)}.")
             continue
-        yield Plot(name=name, figure=drawn(rows), rows=behind(rows), caption=describe(kind, rows, folders))
+        yield Plot(
+            name=name,
+            figure=drawn(rows),
+            rows=behind(rows),
+            caption=caption(kind, rows),
+            notes=notes(rows, folders),
+            table=late_shares(rows),
+        )
 
 
 def rows_of(folder: Path, study: Path) -> list[dict[str, object]]:
@@ -158,27 +165,51 @@ def names_of(rows: Rows) -> set[tuple[object, object]]:
     return {(row["folder"], row["run"]) for row in rows}
 
 
-def describe(kind: Kind, rows: Rows, folders: Sequence[Path]) -> str:
-    """What is seen, with the share of each probe over the last part of training."""
+def caption(kind: Kind, rows: Rows) -> str:
+    """What is drawn."""
     runs = len(names_of(rows))
-    last = []
-    for model, words in MODELS.items():
-        shares = {probe: late_share(rows, probe, model) for probe in PROBES}
-        told = [f"{probe} {in_words(*share)}" for probe, share in shares.items() if np.isfinite(share[0])]
-        last.append(f"a model that {words}: {', '.join(told)}")
-    return (
-        f"Squared error of the ensemble's mean prediction over training on {kind.environment}, {kind.task}, "
-        f"{kind.designs} designs, {runs} run(s); both models learn from the same batches. Seen: one more episode of "
-        "each design, by the individual policy that learnt on it. Next and never built: episodes by pi_Pop, the "
-        "population's policy, of that time; so they differ from seen in their bodies and in their policies. Runs that "
-        "diverge are measured until then. Above: the error as a share of that of predicting no change on the same "
-        "transitions, each entry of the observation in units of the variance of its one-step changes in the replay; a "
-        f"model at 1 knows nothing of the change, panels end at {MOST:g}. Below: the error in the raw units of "
-        "the observation, as the paper prints it; the less the states of a probe move, the smaller it is. "
-        f"{of_several(rows, folders) if runs > 1 else ''}Shares over the last {LAST:.0%} of training (after step "
-        f"{first_late_step(rows):,}), the sum of a run's errors over the sum of those of predicting no change"
-        f"{', mean over runs' if runs > 1 else ''}: {'; '.join(last)}."
+    words = (
+        f"Squared error of the model's mean prediction on {kind.environment}, {kind.task}, {kind.designs} designs, "
+        f"{runs} run{'s' * (runs > 1)}. Above: as a share of the error of predicting no change; at 1 a model knows "
+        "nothing of the change. Below: in raw units."
     )
+    if runs > 1:
+        words += (
+            " Faint: single runs. Strong: their mean. Bands and bars: pointwise 95 % bootstrap intervals over runs."
+        )
+    return words
+
+
+def notes(rows: Rows, folders: Sequence[Path]) -> list[str]:
+    """How the errors were measured and joined."""
+    found = [
+        "Both models learn from the same batches. Models are tested on transitions that they do not learn from.",
+        "Designs seen: one more episode of each design, by the individual policy that learnt on it. Next design and "
+        "designs never built: episodes by the population's policy of that time. So these differ from designs seen in "
+        "their bodies and in their policies.",
+        "Share: each entry of the observation counts in units of the variance of its one-step changes in the replay, "
+        f"and the error of predicting no change is that on the same transitions. Panels end at {MOST:g}.",
+        "Raw error: in the units of the observation, as in the paper. It is smaller where the states move less.",
+        "A run that diverges is measured until then.",
+    ]
+    if len(names_of(rows)) > 1:
+        found += of_several(rows, folders)
+    found.append(
+        f"The table has the shares over the last {LAST:.0%} of training (after step {first_late_step(rows):,}): the "
+        "sum of a run's errors over the sum of those of predicting no change, as a mean over runs with its 95 % "
+        "interval where there are several."
+    )
+    return found
+
+
+def late_shares(rows: Rows) -> list[dict[str, object]]:
+    """Share of the change that is not explained at the end of training, for all that was measured by each model."""
+    table = []
+    for probe, (*_, words) in PROBES.items():
+        found = {model: late_share(rows, probe, model) for model in MODELS}
+        if any(np.isfinite(value) for value, _, _ in found.values()):
+            table.append({"transitions": words} | {MODELS[model]: in_words(*share) for model, share in found.items()})
+    return table
 
 
 def in_words(value: float, low: float, high: float) -> str:
@@ -186,15 +217,12 @@ def in_words(value: float, low: float, high: float) -> str:
     return f"{value:.3g}" + (f" ({low:.3g} to {high:.3g})" if np.isfinite(low) else "")
 
 
-def of_several(rows: Rows, folders: Sequence[Path]) -> str:
-    """Sentences on how runs were joined."""
-    told = (
-        "Faint: single runs. Strong: their mean. Bands and bars: pointwise 95 % intervals of the bootstrap over runs "
-        f"({RESAMPLES} resamples). "
-    )
+def of_several(rows: Rows, folders: Sequence[Path]) -> list[str]:
+    """Notes on how runs were joined."""
+    found = [f"The bootstrap has {RESAMPLES} resamples."]
     every = [curves(rows, probe, model, "mse") for probe in PROBES for model in MODELS]
-    if any(not found.shared.all() for found in every):
-        told += "The mean is drawn at the steps at which all runs that had got so far have a number. "
+    if any(not one.shared.all() for one in every):
+        found.append("The mean is drawn at the steps at which all runs that had got so far have a number.")
     if different := differences(folders):
-        told += f"The runs differ in more than their seed: {', '.join(different)}. "
-    return told
+        found.append(f"The runs differ in more than their seed: {', '.join(different)}.")
+    return found

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import BLACK, GREY, put_legend
-from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.figures.figure import Plot, missing, shown
 from coim.experiments.figures.legend import point_entries
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, interval, iqm, mean
 from coim.experiments.statistics.measures import MEASURES, Cells, Measured, comparisons, limits, measure, predictions
@@ -19,9 +19,14 @@ from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
 LABELS = {"area": "area: mean best return\nof a design (1)", "final": "final: highest\nbest return (1)"}
-ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not"
+ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not."
 OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
-INTERVALS = f"Intervals: {CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples). "
+INTERVALS = f"Intervals are {CONFIDENCE:.0%} percentile bootstraps over runs ({RESAMPLES} resamples)."
+AREA = "area: the mean over designs of the best return of a design. final: the highest best return of all designs."
+ARMS_SHOWN = ("environment", "task", "arm", "planned", "over", "diverged")
+ARMS_SHOWN += ("area_iqm", "final_iqm", "search_gain", "rank_correlation_given_order")
+PAIRS_SHOWN = ("environment", "task", "measure", "arm", "against", "difference", "improvement")
+PAIRS_SHOWN += ("welch_p_holm", "paired_p_holm", "detectable")
 
 
 def plots(study: Path) -> Iterator[Plot]:
@@ -35,7 +40,7 @@ def plots(study: Path) -> Iterator[Plot]:
 
 
 def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
-    """Area and final best return of every arm, and everything else that is said of an arm, as a table."""
+    """Area and final best return of every arm, with a table of all measures of an arm."""
     rows, places = [], []
     for place in runs.places:
         own = [m for m in measured if (m.run.environment, m.run.task) == place]
@@ -43,26 +48,39 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
             places.append(place)
             rows += [summary(runs, place, arm, [m for m in own if m.run.arm == arm]) for arm in runs.arms_at(place)]
     if not places:
-        return missing("statistics_arms", f"No run has tried all its designs yet. {runs.in_words(runs.arms)}")
+        return missing("statistics_arms", "No run has tried all its designs yet.", runs.in_words(runs.arms))
     figure, grid = new_figure(0.4 + (2.4 + room_for_names(runs.arms)) * len(places), len(places), len(MEASURES))
     axes_of = iter(grid)
     for place in places:
         for name in MEASURES:
             draw_arms(next(axes_of), runs, place, name, measured)
     caption = (
-        "Runs that have tried all their designs, or diverged: points. Bars: interquartile means (IQM) and their "
-        f"intervals; ticks: means. {INTERVALS}area: the mean over designs of a design's best return; final: the "
-        "highest of all designs. search_gain: mean best return of the designs that maximised Q minus that of the "
-        "random ones, which take turns with them, mean over runs. This and what follows, up to bias, is of the designs "
-        "that a run reached, and _runs the number of runs that have a value. rank_correlation: Spearman's, of Q(xi) "
-        "before a body was built and the best return on it, over the bodies after the first ones, mean over runs; "
-        "_given_order: the partial one with the order of building held fixed, as Q and returns both rise while the "
-        "networks learn. bias: (1 - gamma) Q(xi) - best return / steps, both a reward per step, equal if the reward is "
-        f"constant, of bodies that maximised Q and of the random ones; {ENTROPY}. diverged_share: of the runs that "
-        "have begun. hours: wall-clock of a run's cell; hours and updates: mean over runs. "
-        f"{runs.in_words(runs.arms, counted=True)}"
+        "Area under the best-return curve and final best return of every arm. Points: runs that have tried all their "
+        "designs or diverged. Bars: interquartile mean (IQM) and its 95 % bootstrap interval over runs. Ticks: means."
     )
-    return Plot(name="statistics_arms", figure=figure, rows=rows, caption=caption, readable=True)
+    notes = (
+        AREA,
+        INTERVALS,
+        "search_gain: mean best return of designs that maximised Q minus that of random designs, mean over runs.",
+        "rank_correlation: Spearman's correlation of Q(xi) before a body was built and the best return on it, over the "
+        "bodies after the first ones, mean over runs. rank_correlation_given_order: the partial correlation with the "
+        "order of building held fixed, because Q and returns both rise while the networks learn.",
+        "bias_optimised, bias_random: (1 - gamma) Q(xi) minus best return / steps, on designs that maximised Q and on "
+        f"random designs. Both terms are a reward per step, and equal if the reward is constant. {ENTROPY}",
+        "search_gain, the correlations and the biases are over the designs that a run reached; columns that end in "
+        "_runs count the runs that have a value.",
+        "diverged_share: share of the runs that have begun. hours: wall-clock of the cell. hours and updates are means "
+        "over runs.",
+        runs.in_words(runs.arms, counted=True),
+    )
+    return Plot(
+        name="statistics_arms",
+        figure=figure,
+        rows=rows,
+        caption=caption,
+        notes=notes,
+        table=shown(rows, ARMS_SHOWN),
+    )
 
 
 def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cells:
@@ -123,7 +141,7 @@ def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
     """Probability of improvement of every pair of arms that is compared, with the tests as a table."""
     rows = comparisons(runs, measured)
     if not rows:
-        return missing("statistics_pairs", f"No two arms have runs that are over. {runs.in_words(runs.arms)}")
+        return missing("statistics_pairs", "No two arms have runs that are over.", runs.in_words(runs.arms))
     figure, grid = new_figure(0.9 + 0.26 * max(4, len(rows) // 2), 1, len(MEASURES))
     for axes, name in zip(grid, MEASURES):
         own = [row for row in rows if row["measure"] == name]
@@ -137,16 +155,31 @@ def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
         axes.set(title=name, yticks=range(len(own)), yticklabels=labels if name == MEASURES[0] else [])
         axes.tick_params(axis="y", labelsize=7)
     caption = (
-        "Probability that a run of one arm ends above a run of the other, ties counting half, by the area under the "
-        f"best-return curve and by the highest best return; 1 means that no run of the other was above one of it, "
-        f"which few runs often show by chance. {INTERVALS}all: the mean over the environments and tasks in which both "
-        "arms have runs, each resampled by itself. difference and welch_p: of the arms, Welch's t-test, two-sided; "
-        "detectable: the difference that it finds (p below 0.05, uncorrected) in 80% of studies with these spreads and "
-        "numbers of runs; paired_difference and paired_p: of the runs that share their seed, paired t-test (with five "
-        "pairs Wilcoxon's test cannot go below 0.0625); _holm: corrected by Holm over all tests of that kind by that "
-        f"measure in this table. {runs.in_words(runs.arms, counted=True)}"
+        "Probability of improvement: that a run of one arm ends above a run of the other, ties counting half, by area "
+        "and by final best return. Points: estimates. Bars: 95 % bootstrap intervals over runs. Dashed: no difference."
     )
-    return Plot(name="statistics_pairs", figure=figure, rows=rows, caption=caption, readable=True)
+    notes = (
+        AREA,
+        f"{INTERVALS} A probability of 1 means that no run of the other arm was above one of this arm; few runs often "
+        "show that by chance.",
+        "all: the mean over the environments and tasks in which both arms have runs, each resampled by itself.",
+        "difference: of the means of the two arms. welch_p: Welch's t-test, two-sided.",
+        "detectable: the difference that Welch's test finds (p below 0.05, uncorrected) in 80% of studies with these "
+        "spreads and numbers of runs.",
+        "paired_difference, paired_p: over the runs that share their seed, by a paired t-test. With five pairs "
+        "Wilcoxon's test cannot go below 0.0625.",
+        "_holm: corrected by Holm over all tests of that kind by that measure in this table. The uncorrected values "
+        "are in the CSV.",
+        runs.in_words(runs.arms, counted=True),
+    )
+    return Plot(
+        name="statistics_pairs",
+        figure=figure,
+        rows=rows,
+        caption=caption,
+        notes=notes,
+        table=shown(rows, PAIRS_SHOWN),
+    )
 
 
 def predicted(runs: Runs) -> Plot:
@@ -177,12 +210,16 @@ def predicted(runs: Runs) -> Plot:
         axes.remove()
     put_legend(figure, point_entries({str(row["arm"]) for row in rows}))
     caption = (
-        "Eq. 5 before anything was learnt on a body, against the best return on it, a point for each design. "
-        "(1 - gamma) Q and return / steps are both a reward per step and equal (dashed) if the reward is constant; Q "
-        "weighs the first 1 / (1 - gamma) steps, and is of the population's policy, the return of the best individual "
-        f"one; {ENTROPY}. {runs.in_words(runs.arms)}"
+        "Eq. 5 before a body was built, against the best return on it: a point for each design, both as a reward per "
+        "step. Dashed: equal."
     )
-    return Plot(name="statistics_predictions", figure=figure, rows=rows, caption=caption)
+    notes = (
+        "(1 - gamma) Q and return / steps are equal if the reward is constant.",
+        "Q weighs the first 1 / (1 - gamma) steps and is that of the population's policy; the return is that of the "
+        f"best individual policy. {ENTROPY}",
+        runs.in_words(runs.arms),
+    )
+    return Plot(name="statistics_predictions", figure=figure, rows=rows, caption=caption, notes=notes)
 
 
 OF_RUN = (
@@ -201,9 +238,9 @@ PREDICTED = ("design", "kind", "predicted", "best_return", "predicted_per_step",
 
 
 def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
-    """Wall-clock and updates of every run, with all that was measured of it as a table."""
+    """Wall-clock and updates of every run; the CSV has all measures of a run."""
     if not measured:
-        return missing("statistics_runs", f"No run has begun. {runs.in_words(runs.arms)}")
+        return missing("statistics_runs", "No run has begun.", runs.in_words(runs.arms))
     rows: list[Cells] = [
         {"environment": m.run.environment, "task": m.run.task, "arm": m.run.arm, "seed": m.run.seed}
         | {"run": m.run.number, "state": m.run.state, "designs": len(m.run.designs), "planned": m.run.num_designs}
@@ -223,8 +260,12 @@ def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
         axes.set(ylabel=labels[name], title=", ".join(place))
         axes.set_ylim(0, 1.1 * max(getattr(m, name) for m in here))
     caption = (
-        "What every run took, also those under way: wall-clock of its cell, whatever else the machine did meanwhile, "
-        "and updates of both learners and the ensemble together. episode_seconds: the median over its episodes, with "
-        f"their updates and evaluation. {runs.in_words(runs.arms)}"
+        "Wall-clock and updates of every run, also of those under way. Points: runs. Updates are those of both "
+        "learners and the ensemble together."
     )
-    return Plot(name="statistics_runs", figure=figure, rows=rows, caption=caption)
+    notes = (
+        "Wall-clock is that of the run's cell, whatever else the machine did meanwhile.",
+        "episode_seconds: the median over the run's episodes, with their updates and evaluation.",
+        runs.in_words(runs.arms),
+    )
+    return Plot(name="statistics_runs", figure=figure, rows=rows, caption=caption, notes=notes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -19,6 +19,8 @@ from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, w
 from coim.experiments.run.progress import counted
 from coim.experiments.run.records import number
 from coim.experiments.statistics.intervals import FEW
+from coim.experiments.study.arms import arm_named
+from coim.experiments.study.runs import read_runs
 from coim.run_folder import read_config
 
 MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
@@ -39,8 +41,8 @@ def write_figures(study: Path, out: Path | None = None) -> list[Plot]:
         The plots, also those that have no figure because their input is not there.
 
     Raises:
-        ValueError: if the folder is no study's, nor has a measured run, or that for the figures holds a page of
-            somebody else.
+        ValueError: if the folder holds neither a study nor a measured run, or the folder for the figures holds
+            another page.
         OSError: if the figures cannot be written.
     """
     folder, found = out or study / "figures", []
@@ -48,7 +50,7 @@ def write_figures(study: Path, out: Path | None = None) -> list[Plot]:
     measured_only = (study / FOLDER).is_dir() and not (study / "cells").is_dir()
     modules = OF_MODELS if measured_only else MODULES
     with mpl.rc_context(FONT), naming_out(folder):
-        for module in counted(modules, len(modules), "figures: parts"):
+        for module in counted(modules, len(modules), "figures"):
             for plot in module.plots(study):
                 folder.mkdir(parents=True, exist_ok=True)
                 write_plot(folder, plot)
@@ -60,7 +62,7 @@ def write_figures(study: Path, out: Path | None = None) -> list[Plot]:
 
 
 def drawn_before(folder: Path) -> set[str]:
-    """Names of the plots of an earlier drawing, which may have been called otherwise: by its page.
+    """Names of the plots on the page of an earlier drawing; they may differ from today's.
 
     Raises:
         ValueError: if the page that is there is no page of figures.
@@ -75,13 +77,13 @@ def drawn_before(folder: Path) -> set[str]:
 
 
 def remove(folder: Path, name: str) -> None:
-    """Take away the files of one plot."""
+    """Delete the files of one plot."""
     for suffix in SUFFIXES:
         (folder / f"{name}.{suffix}").unlink(missing_ok=True)
 
 
 def write_plot(folder: Path, plot: Plot) -> None:
-    """The files of one plot; those of an earlier drawing that has nothing to show any more are removed."""
+    """Write the files of one plot, or delete those of an earlier drawing if there is nothing to draw any more."""
     files = {suffix: folder / f"{plot.name}.{suffix}" for suffix in SUFFIXES}
     remove(folder, plot.name)
     if plot.figure is None:
@@ -92,28 +94,45 @@ def write_plot(folder: Path, plot: Plot) -> None:
         plot.figure.savefig(aside, metadata={"CreationDate": None})
     rows = ({key: cell(value, digits=7) for key, value in row.items()} for row in plot.rows)
     write_whole(files["csv"], as_csv(list(plot.rows[0]), rows))
-    if plot.readable:
-        write_whole(files["md"], f"{plot.caption}\n\n{table(plot.rows)}")
+    if plot.table:
+        write_whole(files["md"], "\n".join([plot.caption, "", table(plot.table), *notes(plot)]))
 
 
-def page(study: Path, plots: Iterable[Plot]) -> str:
-    """All figures with their captions, in Markdown."""
+def page(study: Path, plots: Sequence[Plot]) -> str:
+    """All figures with their captions, tables and notes, in Markdown."""
     lines = [
         f"{TITLE}{study.resolve().name}",
         "",
         f"Written by `coim figures`. {FEW}",
         "",
     ]
-    lines += [made_by(study), ""] if (study / "cells").is_dir() else []
+    if (study / "cells").is_dir():
+        lines += [made_by(study), "", *arms_in_words(read_runs(study).arms)]
     for plot in plots:
         lines += [f"## {plot.name}", ""]
         if plot.figure is not None:
             files = ", ".join(f"[{suffix}]({plot.name}.{suffix})" for suffix in ("pdf", "csv"))
             lines += [f"![{plot.name}]({plot.name}.png)", "", f"{plot.caption} ({files})", ""]
-            lines += [table(plot.rows), ""] if plot.readable else []
         else:
             lines += [f"Not drawn. {plot.caption}", ""]
+        lines += [table(plot.table)] if plot.table else []
+        lines += notes(plot)
     return "\n".join(lines)
+
+
+def notes(plot: Plot) -> list[str]:
+    """Lines with the notes of a plot, a point of a list each."""
+    selected = plot.table and {*plot.table[0]} < {*plot.rows[0]}
+    more = [f"All columns are in the [CSV]({plot.name}.csv)."] if selected else []
+    points = [f"- {note}" for note in (*plot.notes, *more)]
+    return ["Notes:", "", *points, ""] if points else []
+
+
+def arms_in_words(names: Sequence[str]) -> list[str]:
+    """Lines with a table of arms: what each does, and what it is compared with."""
+    rows = [{"arm": name, "what it does": (arm := arm_named(name)).words, "compared with": ", ".join(arm.baselines)}
+            for name in names]  # fmt: skip
+    return [table(rows)] if rows else []
 
 
 def made_by(study: Path) -> str:
@@ -131,7 +150,7 @@ def made_by(study: Path) -> str:
 
 
 def revisions_of(folder: Path) -> set[str]:
-    """Of the code that began a run and of those that went on with it, where they have noted it."""
+    """Revisions of the code that began a run and of those that went on with it, where they are noted."""
     config = read_config(folder)
     noted = [config.get("revision"), *(entry.get("revision", "") for entry in config.get("resumed", []))]
     return {"unknown" if revision is None else revision[:12] for revision in noted if revision != ""}

@@ -27,19 +27,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from coim.experiments.drawing.layout import new_figure
-from coim.experiments.drawing.palette import GREY
-from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, SEED, holm
 from coim.experiments.statistics.measures import welch
-from coim.experiments.study.arms import arm_named, in_order, pairs_of_arms
+from coim.experiments.study.arms import in_order, pairs_of_arms
 from coim.experiments.study.runs import Place, Run, runs_of_folder
 
 Line = dict[str, str]
 
-NAME = "figure_2_tests"
 TESTS = ("welch_designs_p", "welch_runs_p")
 Cells = dict[str, object]
 
@@ -116,41 +111,6 @@ def interval_over_runs(x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> tupl
         means.append(totals[drawn].sum(1) / counts[drawn].sum(1))
     low, high = np.quantile(means[0] - means[1], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(low), float(high)
-
-
-def draw(table: Sequence[Cells]) -> Plot:
-    """Differences with their intervals, a line for each pair and a panel for each environment and task."""
-    if not table:
-        return missing(NAME, "No two arms that are compared have retrained designs.")
-    places = list(dict.fromkeys((str(row["environment"]), str(row["task"])) for row in table))
-    own = {place: [row for row in table if (row["environment"], row["task"]) == place] for place in places}
-    figure, grid = new_figure(sum(0.8 + 0.3 * len(rows) for rows in own.values()), len(places))
-    for axes, (place, rows) in zip(grid, own.items()):
-        draw_panel(axes, rows)
-        axes.set(title=", ".join(place))
-    grid[-1].set(xlabel="difference of the mean best return, retrained from scratch (1)")
-    caption = (
-        "Fig. 2 in numbers: the difference of the means over the retrained designs of two arms (points) and its "
-        f"{CONFIDENCE:.0%} percentile bootstrap over runs ({RESAMPLES} resamples, all designs of a run together; bars, "
-        "none where an arm has less than two runs). designs, bodies, runs: retrained designs of the arm, distinct "
-        "bodies among them, and runs of the study that they come from; _against: of the other arm. welch_designs_p: "
-        "Welch's t-test over designs, two-sided, as the paper does it. welch_runs_p: the same over one mean for each "
-        "run. _holm: corrected by Holm over all tests of that kind in this table. Designs of one run are not "
-        "independent: in simulated studies without a difference, of five runs with five designs, welch_designs_p is "
-        "below 0.05 in 23 %, welch_runs_p in 5 %, and the interval leaves out 0 in 13 %."
-    )
-    return Plot(name=NAME, figure=figure, rows=table, caption=caption, readable=True)
-
-
-def draw_panel(axes: Axes, rows: Sequence[Cells]) -> None:
-    """One environment and task; the first pair on top."""
-    for y, row in enumerate(reversed(rows)):
-        arm = arm_named(str(row["arm"]))
-        axes.plot([row["difference_low"], row["difference_high"]], [y, y], linewidth=2, color=arm.colour)
-        axes.plot(row["difference"], y, **arm.point)
-    axes.axvline(0, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-    labels = ["{arm} minus {against}".format(**row) for row in reversed(rows)]
-    axes.set(ylim=(-0.7, len(rows) - 0.3), yticks=range(len(rows)), yticklabels=labels)
 
 
 def results(folder: Path, listed: Sequence[Line]) -> tuple[list[Cells], int]:

@@ -12,11 +12,13 @@ from matplotlib.image import imread
 
 from coim.experiments.commands.figures import main
 from coim.experiments.figures import best_returns as returns
-from coim.experiments.figures import statistics
+from coim.experiments.figures import statistics, write
 from coim.experiments.figures.figure import Plot
 from coim.experiments.figures.write import write_figures
-from tests.experiments.made_up_study import read_table, write_cell, write_ledger, write_table
+from coim.experiments.study.arms import ARMS
+from tests.experiments.made_up_study import check_words, read_table, write_cell, write_ledger, write_table
 
+RESULTS = Path(__file__).parents[3] / "docs" / "results"
 DRAWN = ["figure_1_best_returns", "figure_3_best_returns", "statistics_arms", "statistics_pairs"]
 DRAWN += ["statistics_predictions", "statistics_runs"]
 
@@ -101,7 +103,7 @@ def test_the_table_of_arms_counts_planned_and_diverged_runs(study: Path) -> None
     assert float(known["area_mean"]) == pytest.approx((27 + (14 + 24 + 1 + 1) / 4) / 2)
     assert (none["over"], float(none["final_iqm"])) == ("4", 30)
     text = (study / "figures" / "statistics_arms.md").read_text()
-    assert "| hopper | forward | known | 5 | 2 | 1 | 0.333 |" in text
+    assert "| hopper | forward | known | 5 | 2 | 1 | " in text
     assert "nan" not in text
     assert "6 of 10 runs are over, 1 under way, 3 to come" in text
 
@@ -216,10 +218,10 @@ def test_a_study_of_which_every_run_diverged_at_once_is_told_not_drawn(tmp_path:
     write_table(folder / "designs.csv", ["run", "design", "kind", "predicted", "best_return"], [])
     found = {plot.name: plot for plot in write_figures(tmp_path)}
     assert found["statistics_arms"].figure is None
-    assert "1 of them diverged" in found["statistics_arms"].caption
+    assert "1 of them diverged" in found["statistics_arms"].notes[0]
 
 
-def test_the_caption_tells_what_other_arms_do_and_places_of_other_arms_have_no_panel(tmp_path: Path) -> None:
+def test_the_page_tells_what_the_arms_do_and_places_of_other_arms_have_no_panel(tmp_path: Path) -> None:
     write_cell(tmp_path, "hopper-forward-control-only-0", [10, 20, 30, 40])
     write_cell(tmp_path, "hopper-forward-none-0", [10, 20, 30, 40])
     write_cell(tmp_path, "walker-forward-oracle-0", [10, 20, 30, 40])
@@ -228,8 +230,33 @@ def test_the_caption_tells_what_other_arms_do_and_places_of_other_arms_have_no_p
     figure = figures["figure_1_best_returns"].figure
     assert figure is not None
     assert "walker" not in " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
-    assert "control-only imagines nothing and keeps one body" in figures["best_returns_bodies"].caption
-    assert "control-only" not in figures["figure_1_best_returns"].caption
+    page = write.page(tmp_path, [])
+    assert "| control-only | imagines nothing and keeps one body | none |" in page
+    assert "| known |" not in page
+
+
+def test_captions_are_short_and_tables_narrow_in_any_state_of_a_study(study: Path, tmp_path: Path) -> None:
+    check_words(write_figures(study))
+    empty = tmp_path / "empty"
+    (empty / "cells" / "hopper-forward-none-0").mkdir(parents=True)
+    check_words(write_figures(empty))
+    for seed, arm in enumerate(ARMS):
+        write_cell(study, f"walker-backward-{arm}-{seed + 10}", [10, 20, 30, 40])
+    found = write_figures(study)
+    check_words(found)
+    page = (study / "figures" / "README.md").read_text()
+    assert max(line.count(" | ") + 1 for line in page.splitlines() if line.startswith("| ")) == 10
+    pairs = next(plot for plot in found if plot.name == "statistics_pairs")
+    assert set(pairs.table[0]) < set(pairs.rows[0])  # the rest is in the CSV
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.rglob("*.md")), ids=lambda path: path.relative_to(RESULTS).as_posix())
+def test_tables_and_captions_of_the_results_are_short_too(path: Path) -> None:
+    lines = path.read_text().splitlines()
+    assert max((line.count("|") - 1 for line in lines if line.startswith("|")), default=0) <= 10
+    for image, caption in zip(lines, lines[2:]):
+        if image.startswith("!["):
+            assert len(caption.split()) <= 60 + 2  # and the links to the files
 
 
 def test_figures_that_are_called_otherwise_now_leave_none_behind(study: Path) -> None:

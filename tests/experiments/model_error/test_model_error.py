@@ -22,6 +22,7 @@ from coim.experiments.model_error import algorithm as probed
 from coim.experiments.model_error.run import probe, write_design_space
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.settings import Settings
+from tests.experiments.made_up_study import check_words
 
 PROBES = ["seen", "never built", "noisy", "noisy possible", "random", "random possible"]
 OPTIONS = ["--num-designs", "4", "--first-episodes", "2", "--episodes", "2", "--episode-steps", "6", "--num-cells", "8"]
@@ -234,9 +235,9 @@ def test_the_figures_show_what_was_measured(study: Path) -> None:
             np.testing.assert_allclose(drawn[probe_name], np.array(expected).reshape(-1, 2), rtol=1e-6)
         assert ("no change" in drawn) == (column == "normalised")
     last = [row for row in measured if is_of(row, "seen", "next") or is_of(row, "seen", "nothing")][-2:]  # of 48 steps
-    assert (
-        f"seen {float(last[0]['normalised']) / float(last[1]['normalised']):.3g}" in errors.caption.split("next obs")[1]
-    )
+    share = float(last[0]["normalised"]) / float(last[1]["normalised"])
+    assert errors.table[0]["learns the next observation"] == f"{share:.3g}"
+    check_words([errors, space])
 
 
 def is_of(row: dict[str, str], probe_name: str, predict: str) -> bool:

@@ -14,7 +14,7 @@ from coim.experiments.figures.figure import Plot
 from coim.experiments.model_error import algorithm as probed
 from coim.experiments.model_error.design_space import FILE
 from coim.experiments.model_error.tables import curves, late_share
-from tests.experiments.made_up_study import write_table
+from tests.experiments.made_up_study import check_words, write_table
 
 STEPS = (10, 20, 30, 40)
 
@@ -75,9 +75,10 @@ def test_folders_and_runs_of_a_fleet_are_runs_of_one_figure_with_an_interval(tmp
     # Three runs are drawn alike in 1 of 27 resamples, more than the 2.5 % beyond each end.
     assert (means[0]["share_low"], means[0]["share_high"]) == (0.25, 1.5)
     assert (means[3]["mse_low"], means[3]["mse_high"]) == (3, 10)
-    assert "3 run(s)" in plot.caption
-    assert "seen 0.233 (0.075 to 0.5)" in plot.caption  # the last of four
-    assert "differ" not in plot.caption.split("Bands")[1]
+    assert "3 runs" in plot.caption
+    assert plot.table[0]["learns the change"] == "0.233 (0.075 to 0.5)"  # the last of four
+    assert "The runs differ" not in " ".join(plot.notes)
+    check_words([plot])
 
 
 def test_a_lone_run_has_neither_a_mean_nor_an_interval(tmp_path: Path) -> None:
@@ -107,14 +108,14 @@ def test_a_mean_is_of_steps_at_which_all_runs_that_had_got_so_far_were_measured(
     assert lines_of(plot, 0, "seen") == [[[10, 2.5], [20, 3], [30, 4]]]
     assert [len(line) for line in lines_of(plot, 0, "_seen")] == [5, 2]
     assert [row["runs"] for row in series(plot, "mean")] == [2, 2, 1]
-    assert "at the steps at which all runs that had got so far have a number" in plot.caption
+    assert "at the steps at which all runs that had got so far have a number" in " ".join(plot.notes)
 
 
 def test_runs_that_differ_in_more_than_their_seed_are_told(tmp_path: Path) -> None:
     write_measured(tmp_path, "a", [2.0], seed=0, batch_size=256, out="a")
     write_measured(tmp_path, "b", [4.0], seed=1, batch_size=128, out="b")
     (plot,) = model_error.plots(tmp_path)
-    assert "The runs differ in more than their seed: batch_size." in plot.caption
+    assert "The runs differ in more than their seed: batch_size." in plot.notes
 
 
 def test_over_the_last_quarter_a_measurement_counts_by_how_much_moves_in_it() -> None:
@@ -149,5 +150,6 @@ def test_of_several_folders_the_first_is_looked_into_and_the_others_are_named(tm
     assert [*plots] == ["figure_4b_design_space_hopper_backward", "figure_4b_design_space_hopper_forward"]
     backward, forward = plots.values()
     assert [float(str(plot.rows[0]["normalised/next"])) for plot in (backward, forward)] == [2, 1]
-    assert "Of model_error/a, the first by name; not drawn: model_error/c." in forward.caption
-    assert backward.caption.endswith("Of model_error/b.")
+    assert forward.notes[-1] == "The models are those of model_error/a, the first by name. Not drawn: model_error/c."
+    check_words(plots.values())
+    assert backward.notes[-1] == "The models are those of model_error/b."
