@@ -18,12 +18,14 @@ if TYPE_CHECKING:
     from coim.coadaptation import CoAdaptation
     from coim.designs import (
         DesignGenerator,
+        DesignPosterior,
         DesignSearch,
         GradientSearch,
         KnownDesigns,
         NoisyDesigns,
         ParticleSwarm,
         RandomDesigns,
+        TrustRegion,
     )
     from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
     from coim.episode import run_episode
@@ -53,12 +55,14 @@ else:
             "coadaptation": ["CoAdaptation"],
             "designs": [
                 "DesignGenerator",
+                "DesignPosterior",
                 "DesignSearch",
                 "GradientSearch",
                 "KnownDesigns",
                 "NoisyDesigns",
                 "ParticleSwarm",
                 "RandomDesigns",
+                "TrustRegion",
             ],
             "learners.dynamics": ["DynamicsLearner"],
             "envs": [
@@ -98,6 +102,7 @@ __all__ = [
     "DesignChosen",
     "DesignDone",
     "DesignGenerator",
+    "DesignPosterior",
     "DesignSearch",
     "DesignValue",
     "DynamicsLearner",
@@ -122,6 +127,7 @@ __all__ = [
     "StackedMLP",
     "TransitionBuffer",
     "TriedDesign",
+    "TrustRegion",
     "WalkerMorph",
     "WorldModelEnv",
     "batch_parts",

@@ -23,6 +23,7 @@ RANKS |= {name: 2 for name in ("continuation", "coadaptation", "checkpoints", "s
 RANKS |= {name: 2 for name in ("governor", "imagined_replay")}
 RANKS |= {"experiments": 3}
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
+HOMES |= {name: "designs" for name in ("botorch", "gpytorch", "linear_operator")}
 HOMES |= {name: "experiments" for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray")}
 REFUSED = {"utils", "common", "core", "helpers", "misc", "trainers"}
 DYNAMIC_IMPORTS = {"importlib.import_module", "import_module", "__import__"}

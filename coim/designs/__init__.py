@@ -1,4 +1,4 @@
-"""Generators G of imagined designs, and searches for the next body.
+"""Generators G of imagined designs, searches for the next body, and the posterior over designs.
 
 A generator is a callable ``(design, *, rng=None) -> design`` (:class:`DesignGenerator`). A search is an object with
 ``maximise(fitness) -> (design, value)`` (:class:`DesignSearch`). A class with that one method adds another of either.
@@ -13,25 +13,31 @@ from coim.lazy import lazy_names
 if TYPE_CHECKING:
     from .generators import DesignGenerator, KnownDesigns, NoisyDesigns, RandomDesigns
     from .gradient_search import GradientSearch
+    from .posterior import DesignPosterior
     from .search import DesignSearch
     from .swarm import ParticleSwarm
+    from .trust_region import TrustRegion
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
             "generators": ["DesignGenerator", "KnownDesigns", "NoisyDesigns", "RandomDesigns"],
             "gradient_search": ["GradientSearch"],
+            "posterior": ["DesignPosterior"],
             "search": ["DesignSearch"],
             "swarm": ["ParticleSwarm"],
+            "trust_region": ["TrustRegion"],
         },
     )
 
 __all__ = [
     "DesignGenerator",
+    "DesignPosterior",
     "DesignSearch",
     "GradientSearch",
     "KnownDesigns",
     "NoisyDesigns",
     "ParticleSwarm",
     "RandomDesigns",
+    "TrustRegion",
 ]

@@ -1,0 +1,222 @@
+"""The posterior over designs: what it learns from returns, how sure it is, when it listens to a critic."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import Tensor
+from torchrl.data import Bounded
+
+from coim.designs import DesignPosterior, GradientSearch, ParticleSwarm, TrustRegion
+from coim.designs.posterior import _fitted
+
+LOW, HIGH = 0.5, 2.0
+SPEC = Bounded(low=LOW, high=HIGH, shape=(2,), dtype=torch.float32)
+SPEC4 = Bounded(low=LOW, high=HIGH, shape=(4,), dtype=torch.float32)
+TOP = torch.tensor([1.0, 1.6])
+
+
+def bowl(designs: Tensor) -> Tensor:
+    """Best at TOP, where it is 0."""
+    return -(designs - TOP.to(designs)).square().sum(-1)
+
+
+def built(number: int, seed: int = 0, *, entries: int = 2) -> Tensor:
+    return LOW + (HIGH - LOW) * torch.rand(number, entries, generator=torch.Generator().manual_seed(seed))
+
+
+def noise(number: int, deviation: float, seed: int = 1) -> Tensor:
+    return deviation * torch.randn(number, generator=torch.Generator().manual_seed(seed))
+
+
+def returns_of(designs: Tensor, deviation: float = 100.0) -> Tensor:
+    return 1000 + 400 * bowl(designs) + noise(len(designs), deviation)
+
+
+@pytest.mark.parametrize("search", [GradientSearch(SPEC, seed=0), ParticleSwarm(SPEC, num_particles=50, seed=0)])
+def test_both_searches_find_the_top_of_a_quadratic_from_noisy_returns(search: GradientSearch | ParticleSwarm) -> None:
+    designs = built(60)
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), optimism=0.0)
+    design, value = search.maximise(posterior)
+    assert design.tolist() == pytest.approx(TOP.tolist(), abs=0.1)
+    assert value == pytest.approx(1000, abs=60)
+
+
+def test_means_follow_the_surface_that_the_returns_were_drawn_from() -> None:
+    designs, others = built(60), built(200, seed=2)
+    mean, _ = DesignPosterior(SPEC, designs, returns_of(designs)).predict(others)
+    truth = 1000 + 400 * bowl(others)
+    assert (mean - truth).square().mean().sqrt() < 0.35 * truth.std()
+
+
+def test_the_fit_is_the_textbook_formula_at_its_own_parameters() -> None:
+    designs, candidates = built(9).double(), built(5, seed=3).double()
+    returns = returns_of(designs)
+    posterior = DesignPosterior(SPEC, designs, returns, prior=bowl, optimism=2.0)
+    kernel = posterior.model.covar_module
+    length, signal = kernel.base_kernel.lengthscale.item(), kernel.outputscale.item()
+
+    def covariance(a: Tensor, b: Tensor) -> Tensor:
+        distance = torch.cdist(a, b) / (HIGH - LOW)
+        return signal * (-0.5 * (distance / length) ** 2).exp() * returns.std() ** 2
+
+    def mean(values: Tensor, order: Tensor) -> Tensor:
+        a = returns.mean() + posterior.model.mean_module.intercept * returns.std()
+        return a + posterior.slope * (values - bowl(designs).mean()) + posterior.trend * order
+
+    noisy = covariance(designs, designs) + posterior.noise**2 * torch.eye(9, dtype=torch.float64)
+    weights = torch.linalg.solve(noisy, covariance(designs, candidates)).T
+    order = torch.arange(10, dtype=torch.float64)
+    expected = mean(bowl(candidates), order[9]) + weights @ (returns - mean(bowl(designs), order[:9]))
+    variance = signal * returns.std() ** 2 - (weights * covariance(candidates, designs)).sum(-1)
+    found, deviation = posterior.predict(candidates)
+    assert torch.allclose(found, expected, rtol=1e-9)
+    assert torch.allclose(deviation, (variance + posterior.noise**2).sqrt(), rtol=1e-9)
+    assert torch.allclose(posterior(candidates), expected + 2 * variance.sqrt(), rtol=1e-9)
+
+
+def test_the_slope_on_a_good_critic_is_positive_and_near_what_its_values_are_worth() -> None:
+    designs = built(30)
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=lambda x: 7 + 2 * bowl(x))
+    assert posterior.slope == pytest.approx(200, rel=0.3)
+
+
+@pytest.mark.parametrize("critic", [lambda x: -bowl(x), lambda x: torch.full((len(x),), 3.0)])
+def test_a_critic_that_says_the_opposite_or_nothing_drops_out_entirely(critic: object) -> None:
+    designs, candidates = built(12), built(50, seed=3)
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=critic)
+    assert posterior.slope == 0.0
+    without = DesignPosterior(SPEC, designs, returns_of(designs))
+    assert without.slope == 0.0
+    assert torch.allclose(posterior(candidates), without(candidates), rtol=1e-4)
+
+
+def test_returns_that_rise_whatever_the_body_are_a_trend() -> None:
+    designs = built(30)
+    level = DesignPosterior(SPEC, designs, returns_of(designs))
+    rising = DesignPosterior(SPEC, designs, returns_of(designs) + 10 * torch.arange(30))
+    assert level.trend == pytest.approx(0, abs=2.5)
+    assert rising.trend == pytest.approx(10, abs=2.5)
+    assert rising.predict(TOP[None])[0].item() == pytest.approx(1000 + 30 * 10, rel=0.1)
+
+
+def test_the_90_percent_interval_covers_80_to_97_percent_of_new_returns() -> None:
+    inside = []
+    for seed in range(40):
+        rng = torch.Generator().manual_seed(seed)
+        top = LOW + (HIGH - LOW) * torch.rand(4, generator=rng)
+        designs, others = built(15, seed, entries=4), built(20, 1000 + seed, entries=4)
+
+        def surface(x: Tensor, top: Tensor = top) -> Tensor:
+            return 1000 - 300 * (x - top).square().sum(-1)
+
+        mean, deviation = DesignPosterior(SPEC4, designs, surface(designs) + noise(15, 400, seed)).predict(others)
+        inside.append((surface(others) + noise(20, 400, 1000 + seed) - mean).abs() < 1.645 * deviation)
+    assert 0.80 < torch.cat(inside).float().mean() < 0.97
+
+
+def test_the_gradient_is_that_of_finite_differences() -> None:
+    designs = built(10)
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=bowl)
+    assert posterior.slope > 0
+    assert torch.autograd.gradcheck(posterior, built(4, seed=5).double().requires_grad_())
+
+
+def test_a_candidates_value_does_not_depend_on_the_others() -> None:
+    designs, candidates = built(10), built(7, seed=5).double()
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=bowl)
+    assert torch.allclose(posterior(candidates)[:1], posterior(candidates[:1]), rtol=1e-12)
+
+
+def test_the_same_data_give_the_same_bits_and_nothing_is_drawn() -> None:
+    designs, candidates = built(15), built(50, seed=3)
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    first = DesignPosterior(SPEC, designs, returns_of(designs), prior=bowl)(candidates)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(6)
+    assert torch.equal(first, DesignPosterior(SPEC, designs, returns_of(designs), prior=bowl)(candidates))
+
+
+def test_neither_the_order_of_rows_nor_that_of_entries_matters() -> None:
+    designs, candidates = built(15).double(), built(50, seed=3).double()
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=bowl)
+    inputs, targets = posterior.model.train_inputs[0], posterior.model.train_targets
+    turned = _fitted(inputs.flip(0), targets.flip(0))
+    at = posterior.inputs(candidates)
+    assert torch.allclose(turned.posterior(at).mean, posterior.model.posterior(at).mean, atol=1e-4)
+    swapped = DesignPosterior(SPEC, designs.flip(-1), returns_of(designs), prior=lambda x: bowl(x.flip(-1)))
+    assert torch.allclose(swapped(candidates.flip(-1)), posterior(candidates), rtol=1e-4)
+
+
+def test_a_body_without_a_return_is_left_out_and_keeps_its_place_in_the_order() -> None:
+    returns = torch.tensor([1.0, math.nan, 3.0, 2.0])
+    posterior = DesignPosterior(SPEC, built(4), returns)
+    assert posterior.model.train_inputs[0][:, 2].tolist() == [0.0, 0.5, 0.75]
+    assert posterior.inputs(built(1))[0, 2] == 1.0
+
+
+def test_dtypes_are_those_of_the_candidates_and_the_critic_is_asked_on_them() -> None:
+    asked = []
+
+    def critic(designs: Tensor) -> Tensor:
+        asked.append(designs.dtype)
+        return bowl(designs)
+
+    posterior = DesignPosterior(SPEC, built(5), returns_of(built(5)), prior=critic)
+    assert posterior(built(3)).dtype == torch.float32
+    assert [part.dtype for part in posterior.predict(built(3))] == [torch.float32] * 2
+    assert asked == [torch.float32] * 3
+
+
+@pytest.mark.parametrize(
+    ("designs", "returns", "arguments", "complaint"),
+    [
+        (built(4), torch.tensor([1.0, 2.0, math.nan, math.inf]), {}, "2 of 4 returns are finite, 3 are needed"),
+        (built(4), torch.tensor([5.0, 5.0, math.nan, 5.0]), {}, "all 3 returns are 5.0"),
+        (built(4), torch.ones(3), {}, r"designs \[4, 2\] and returns \[3\] do not belong together; pass \[N, 2\]"),
+        (built(4, entries=3), torch.arange(4.0), {}, r"designs \[4, 3\] .* pass \[N, 2\]"),
+        (built(3).fill_diagonal_(math.nan), torch.arange(3.0), {}, "design 0 has an entry that is not finite"),
+        (built(3), torch.arange(3.0), {"optimism": -1.0}, "optimism is -1.0"),
+        (built(3), torch.arange(3.0), {"prior": lambda x: x[:, 0] * math.nan}, "the fitness is nan"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(
+    designs: Tensor, returns: Tensor, arguments: dict[str, object], complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        DesignPosterior(SPEC, designs, returns, **arguments)
+
+
+def test_without_botorch_everything_else_works_and_the_posterior_says_what_to_install() -> None:
+    code = (
+        "import sys; sys.modules.update(botorch=None, gpytorch=None, linear_operator=None)\n"
+        "from coim import CoAdaptation, GradientSearch, TrustRegion\n"
+        "from coim import DesignPosterior"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.stderr.splitlines()[-1] == (
+        "ImportError: DesignPosterior needs BoTorch, which is optional: pip install 'coim[posterior]'"
+    )
+    assert "line 3" in result.stderr.splitlines()[1]
+
+
+def test_a_trust_region_holds_the_best_near_its_centre_and_ends_at_the_bounds() -> None:
+    region = TrustRegion(SPEC, GradientSearch(SPEC, seed=0), reach=0.2)
+    near, value = region.maximise(bowl, centre=torch.tensor([1.8, 1.5]))
+    assert near.tolist() == pytest.approx([1.8 - 0.2 * 1.5, 1.6], abs=0.01)
+    assert value == pytest.approx(bowl(near).item())
+    at_edge, _ = region.maximise(lambda x: -x.sum(-1), centre=torch.tensor([0.6, 2.0]))
+    assert at_edge.tolist() == pytest.approx([0.5, 1.7])
+
+
+def test_a_trust_region_refuses_a_centre_outside_and_a_reach_of_nothing() -> None:
+    search = GradientSearch(SPEC, seed=0)
+    with pytest.raises(ValueError, match=r"the centre \[2.5, 1.0\] is not a design"):
+        TrustRegion(SPEC, search).maximise(bowl, centre=torch.tensor([2.5, 1.0]))
+    with pytest.raises(ValueError, match="reach is 0"):
+        TrustRegion(SPEC, search, reach=0)
