@@ -21,7 +21,14 @@ from coim.experiments.run.build import build
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.command_line import parse
 from coim.experiments.run.forecast import Forecast, work_of
-from coim.experiments.run.interrupt import Stopped, locked, on_command_line, says_read_only, stopping_at_once
+from coim.experiments.run.interrupt import (
+    Stopped,
+    locked,
+    on_command_line,
+    says_read_only,
+    sentence_of,
+    stopping_at_once,
+)
 from coim.experiments.run.last_words import last_words
 from coim.experiments.run.machine import (
     FORMERLY,
@@ -122,7 +129,7 @@ def train(
             sys.exit(128 + stop.signum)
         except OSError as error:
             first = f"make {folder} writable; " if says_read_only(error) else ""
-            raise OSError(f"{error}; {first}{again}") from error
+            raise OSError(f"{sentence_of(error)}; {first}{again}") from error
         except RuntimeError as error:  # of Inductor, with its compiler's words
             if not says_full(error):
                 raise

@@ -100,11 +100,29 @@ def on_command_line(*, own_process: bool, also: tuple[type[Exception], ...] = ()
             end_soon(stop.signum)
         sys.exit(128 + stop.signum)
     except (ValueError, OSError, *also) as error:
-        sys.exit(f"{type(error).__name__}: {error}")
+        sys.exit(sentence_of(error))
     except SystemExit as leaving:
         if own_process and isinstance(leaving.__context__, Stopped):
             end_soon(leaving.__context__.signum)
         raise
+
+
+def sentence_of(error: BaseException) -> str:
+    """An error as a sentence, which does not begin with the name of an exception or a number of the system.
+
+    Example:
+        >>> sentence_of(ValueError("num_designs is 0, it must be at least 1"))
+        'num_designs is 0, it must be at least 1'
+        >>> sentence_of(FileNotFoundError(2, "No such file or directory", "runs/a"))
+        'runs/a: No such file or directory'
+        >>> sentence_of(KeyError("seed"))
+        "'seed' (KeyError)"
+    """
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if str(error) and not isinstance(error, KeyError):
+        return str(error)
+    return f"{error} ({type(error).__name__})".strip()  # the text of a KeyError is its key
 
 
 def end_soon(signum: int) -> None:

@@ -16,6 +16,7 @@ from ray.exceptions import RayError, RayTaskError
 from coim.envs import BODIES
 from coim.experiments.run.build import episodes_of_designs
 from coim.experiments.run.forecast import in_words
+from coim.experiments.run.interrupt import sentence_of
 from coim.experiments.run.resume import resumed
 from coim.experiments.run.settings import Settings
 from coim.experiments.study.cell import compute, episodes_done, seconds_of, still_finished, tries
@@ -123,7 +124,7 @@ class Conductor:
         try:
             ray.get(reference)
         except RayError as error:
-            why = f"{type(error.cause).__name__}: {error.cause}" if isinstance(error, RayTaskError) else str(error)
+            why = sentence_of(error.cause if isinstance(error, RayTaskError) else error)
             message = " ".join(why.split())
             self.ledger.note(cell.name, "failed", message=message)
             self._say(cell, f"failed: {message[:200]}; see {self.log_of(cell)}")

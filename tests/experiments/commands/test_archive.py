@@ -117,7 +117,7 @@ def test_a_run_that_is_over_is_finished_whatever_the_ledger_says_and_a_message_i
 ) -> None:
     cells = STUDY.cells()
     ledger = Ledger(study / "ledger.csv", cells)
-    ledger.note(cells[0].name, "failed", message=f"OSError: {tmp_path} was full")
+    ledger.note(cells[0].name, "failed", message=f"{tmp_path} was full")
     main([str(study), str(tmp_path / "kept")])
     row = read_table(tmp_path / "kept" / "ledger.csv")[0]
     assert (row["cell"], row["state"], row["message"]) == (cells[0].name, "finished", "")

@@ -162,7 +162,7 @@ def test_a_body_that_is_not_ours_is_drawn_if_its_class_is_named(runs: Path, tmp_
     ],
 )
 def test_what_is_no_body_is_refused(runs: Path, body: str, sentence: str) -> None:
-    with pytest.raises(SystemExit, match=f"ValueError: --body .*{sentence}"):
+    with pytest.raises(SystemExit, match=f"^--body .*{sentence}"):
         main([str(runs / "one"), "--body", body])
 
 

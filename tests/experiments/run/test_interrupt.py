@@ -18,11 +18,13 @@ from coim.experiments.run.interrupt import on_command_line, stopping_at_once
 
 ROOT = Path(__file__).parents[3]
 COMMANDS = [["coim.experiments", word, "hopper"] for word in WORDS]
+# Scripts to copy are as short as they can be; Python's own traceback is good enough there.
+TO_COPY = {"algorithm1.py", "new_body.py", "new_search.py", "own_pipeline.py"}
 COMMANDS += sorted(
     [".".join(path.relative_to(ROOT).with_suffix("").parts)]
     for package in ("recipes", "benchmarks")
     for path in (ROOT / package).rglob("*.py")
-    if '__name__ == "__main__"' in path.read_text()
+    if '__name__ == "__main__"' in path.read_text() and path.name not in TO_COPY
 )
 
 
@@ -79,10 +81,10 @@ def test_an_error_that_a_stop_has_caused_is_no_error_of_the_input(capsys: pytest
 
 
 def test_errors_are_a_line_if_they_are_expected() -> None:
-    with pytest.raises(SystemExit, match="OSError: no such folder"), on_command_line(own_process=False):
+    with pytest.raises(SystemExit, match=r"^no such folder$"), on_command_line(own_process=False):
         raise OSError("no such folder")
     with (
-        pytest.raises(SystemExit, match="ImportError: no OpenGL"),
+        pytest.raises(SystemExit, match=r"^no OpenGL$"),
         on_command_line(own_process=False, also=(ImportError,)),
     ):
         raise ImportError("no OpenGL")

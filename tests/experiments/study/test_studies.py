@@ -144,10 +144,10 @@ def test_the_ledger_keeps_what_is_finished_and_lets_all_else_wait(tmp_path: Path
     ledger = Ledger(tmp_path / "ledger.csv", cells)
     ledger.note(cells[0].name, "finished", tries=1, seconds=2.5)
     ledger.note(cells[1].name, "running", tries=2)
-    ledger.note(cells[2].name, "failed", tries=3, message='ValueError: "a", b')
+    ledger.note(cells[2].name, "failed", tries=3, message='of "a", b')
     rows = {row.cell: row for row in read_ledger(tmp_path / "ledger.csv")}
     assert [rows[cell.name].state for cell in cells] == ["finished", "running", "failed", "waiting"]
-    assert rows[cells[2].name].message == 'ValueError: "a", b'
+    assert rows[cells[2].name].message == 'of "a", b'
     assert rows[cells[3].name].seed == 4
     again = Ledger(tmp_path / "ledger.csv", cells)
     assert again.in_state("finished") == [cells[0].name]

@@ -91,7 +91,7 @@ def test_a_file_that_is_no_study_is_refused_in_a_sentence_and_leaves_no_folder(
     path.write_text(json.dumps(written))
     with pytest.raises(SystemExit) as stop:
         entry([str(path), "--out", str(tmp_path / "s")])
-    assert str(stop.value.code).startswith(f"ValueError: {path} is no study: ")
+    assert str(stop.value.code).startswith(f"{path} is no study: ")
     assert sentence in str(stop.value.code)
     assert list(tmp_path.iterdir()) == [path]
 

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -152,7 +153,8 @@ def test_a_cell_that_fails_is_tried_again_twice_and_the_others_are_computed(
     bad, good = ledger.entries.values()
     assert (bad.state, bad.tries, good.state, good.tries) == ("failed", 3, "finished", 1)
     assert "hopper-forward-known-0" in bad.message
-    assert "Error: " in bad.message
+    assert bad.message
+    assert not re.match(r"\w*Error", bad.message)
     assert (tmp_path / "logs" / "hopper-forward-known-0.log").read_text().count("Traceback") >= 3
     assert "failed: " in capsys.readouterr().out
     (tmp_path / "cells" / "hopper-forward-known-0").unlink()
@@ -246,7 +248,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     def fail(conductor: Conductor) -> list[str]:
-        conductor.ledger.note("hopper-forward-known-0", "failed", message="ValueError: no luck")
+        conductor.ledger.note("hopper-forward-known-0", "failed", message="no luck")
         return ["hopper-forward-known-0"]
 
     monkeypatch.setattr("coim.experiments.commands.study.ray_running", lambda *_, **__: contextlib.nullcontext())
@@ -255,7 +257,7 @@ def test_cells_that_failed_are_listed_and_the_exit_code_says_so(
     with pytest.raises(SystemExit) as ended:
         entry(["smoke", "--out", str(tmp_path / "s")])
     assert ended.value.code == (
-        "failed, after 3 tries each:\n  hopper-forward-known-0: ValueError: no luck\n"
+        "failed, after 3 tries each:\n  hopper-forward-known-0: no luck\n"
         f"to try them again: coim study smoke --out {tmp_path / 's'}"
     )
     assert capsys.readouterr().out == f"smoke: 2 of 2 cells to compute -> {tmp_path / 's'}\n"
