@@ -25,6 +25,7 @@ from coim.experiments.report.curves import (
 )
 from coim.experiments.report.designs import Picture
 from coim.experiments.run.records import Record, curves, number
+from coim.pairs import IN_THE_FLOOR
 
 LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
     "loss_actor": "actor loss (1)",
@@ -58,14 +59,14 @@ def learning_curves(records: Sequence[Record]) -> Picture:
 
 
 def model_errors(records: Sequence[Record]) -> Picture:
-    """How well the ensemble foresaw each new episode."""
+    """How well the ensemble foresaw each new episode, and what it was asked about."""
     title = "Model error over time"
-    figure, (axes,) = new_figure(3.0)
+    figure, (axes, below) = new_figure(4.6, 2, 1, sharex=True)
     if len(records) == 1:
         mark_builds(axes, records[0])
     if not plot_over_steps(axes, records, "model_error"):
         return Picture(title, "No model was learnt.")
-    axes.set(xlabel=f"{STEPS} (1)", ylabel="squared error over\nvariance of changes (1)", yscale="log")
+    axes.set(ylabel="squared error over\nvariance of changes (1)", yscale="log")
     low, high = axes.get_ylim()
     axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=LogLocator(subs=(3, 4, 6, 7, 8, 9)))
     axes.yaxis.set_major_formatter("{x:g}")
@@ -76,6 +77,15 @@ def model_errors(records: Sequence[Record]) -> Picture:
         "Squared error of the model's means on each new episode before learning from it, in units of the variance of "
     )
     caption += "one-step changes. Dashed: as good as predicting that nothing changes." + points_in_words(records)
+    if plot_over_steps(below, records, "impossible"):
+        below.set(xlabel=f"{STEPS} (1)", ylabel="shares (1)", ylim=(-0.02, 1.02))
+        caption += f" Below: share of imagined pairs with over {100 * IN_THE_FLOOR:.0f} cm of the body in the floor."
+        if plot_over_steps(below, records, "imagined_share", faint=False, linestyle=":"):
+            caption += " Dotted: share of a batch that is imagined."
+    else:  # a run from before they were counted
+        below.set_visible(False)
+        axes.set(xlabel=f"{STEPS} (1)")
+        axes.tick_params(labelbottom=True)
     ends = [f"{r.name}: {m[0]:.3g} to {m[-1]:.3g}" for r in records if (m := _means(r, "model_error")).size]
     return Picture(title, caption, "Model error over training steps. " + "; ".join(ends), figure)
 

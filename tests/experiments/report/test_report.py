@@ -90,6 +90,17 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_the_page_says_what_share_of_the_imagined_pairs_cannot_be(runs: Path, tmp_path: Path) -> None:
+    assert (
+        "Below: share of imagined pairs with over 5 cm of the body in the floor"
+        in check(runs / "one" / "report.html").words
+    )
+    assert "share of a batch that is imagined" not in check(runs / "one" / "report.html").words
+    how = ["--quiet", "--num-designs", "2", "--governed"]
+    experiment.main(HopperMorph, "hopper", tiny("--out", str(tmp_path / "governed"), *how))
+    assert "Dotted: share of a batch that is imagined" in check(tmp_path / "governed" / "report.html").words
+
+
 def under_way(folder: Path, copy: Path, *, rows: int, torn: str = "") -> Path:
     """A copy as it was after that many rows of each table, and a piece of the next."""
     shutil.copytree(folder, copy)
