@@ -256,7 +256,7 @@ def update(effort: Effort, runs: int, device: torch.device) -> Result:
 def iteration(effort: Effort, runs: int, device: torch.device) -> Result:
     """Training episode, refresh, updates, evaluation episode of Half-Cheetah, without and with imagination."""
     on_device = {"num_runs": runs, "device": device, "compile": False, "threads": available_cores()}
-    actions = {name: Iterations(effort, designs=name, **on_device) for name in ("none", "known")}
+    actions = {name: Iterations(effort, imagine=name, **on_device) for name in ("none", "known")}
     times = interleaved({name: synchronised(run, device) for name, run in actions.items()}, effort.long_repeats)
     return rows(
         Figure(

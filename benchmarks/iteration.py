@@ -21,11 +21,11 @@ from coim.experiments.run.settings import Settings
 def iteration(effort: Effort) -> list[Figure]:
     """Training episode, refresh, updates, evaluation episode of Half-Cheetah."""
     actions: dict[str, Callable[[], object]] = {
-        "alone": Iterations(effort, designs="none"),
-        "imagining": Iterations(effort, designs="known"),
+        "alone": Iterations(effort, imagine="none"),
+        "imagining": Iterations(effort, imagine="known"),
     }
     if available_cores() > 1:
-        actions["side by side"] = Iterations(effort, designs="known", side_by_side=True)
+        actions["side by side"] = Iterations(effort, imagine="known", side_by_side=True)
     updates = effort.individual_updates + effort.population_updates
     floor = alone(update_products(effort), times=updates)
     times = interleaved({"floor": floor, **actions}, effort.long_repeats)
@@ -74,7 +74,7 @@ class Iterations:
         self,
         effort: Effort,
         *,
-        designs: str,
+        imagine: str,
         side_by_side: bool = False,
         num_runs: int = 1,
         device: torch.device | str = "cpu",
@@ -82,7 +82,7 @@ class Iterations:
         threads: int | None = None,
     ) -> None:
         settings = Settings(
-            designs=designs,  # type: ignore[arg-type]
+            imagine=imagine,  # type: ignore[arg-type]
             num_designs=1,
             first_episodes=effort.long_repeats + 2,
             episode_steps=effort.episode_steps,

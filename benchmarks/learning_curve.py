@@ -29,9 +29,9 @@ from coim.tables import Layout, read_cells
 
 # Imagined rows in the individual batches too: on a single body the population's networks never act.
 ARMS = {
-    "model-free": Settings(designs="none"),
-    "known designs imagined": Settings(designs="known", individual_imagined_share=0.2),
-    "model-free in bfloat16": Settings(designs="none", precision="bfloat16"),
+    "model-free": Settings(imagine="none"),
+    "known designs imagined": Settings(imagine="known", individual_imagined_share=0.2),
+    "model-free in bfloat16": Settings(imagine="none", precision="bfloat16"),
 }
 COLOURS = dict(zip(ARMS, ("#0072B2", "#D55E00", "#009E73")))  # Okabe and Ito
 COLUMNS = ["arm", "seed", "episode", "return"]

@@ -53,8 +53,8 @@ SMALL = Settings(
 # paper's method with compiled gradients.
 KINDS = {
     "known designs": SMALL,
-    "fleet": dataclasses.replace(SMALL, num_runs=3, designs="noisy", individual_mix=0.2, individual_imagined_share=0.2),
-    "baseline": dataclasses.replace(SMALL, designs="none", search="gradient"),
+    "fleet": dataclasses.replace(SMALL, num_runs=3, imagine="noisy", individual_mix=0.2, individual_imagined_share=0.2),
+    "baseline": dataclasses.replace(SMALL, imagine="none", search="gradient"),
     "compiled": dataclasses.replace(SMALL, compile=True),
 }
 PLAIN = multiprocessing.get_context("forkserver")

@@ -42,7 +42,7 @@ def main(training: Training) -> None:
     threads = available_cores()
     side_by_side = prepare(threads, checked_device("cpu"))
     settings = Settings(
-        designs="none",
+        imagine="none",
         search="gradient",
         num_designs=training.num_designs,
         first_episodes=training.episodes,

@@ -13,6 +13,9 @@ from torch import Tensor
 from coim.events import Kind
 from coim.tables import DESIGN_PREFIX, OF_RUN, read_table
 
+# Settings that older runs have under another name.
+RENAMED = {"designs": "imagine"}
+
 
 @dataclass(frozen=True, eq=False)
 class TriedDesign:
@@ -48,6 +51,9 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder / 'config.json'} is damaged ({error}); put it back from a copy") from None
     if not isinstance(config, dict) or not {"environment", "settings"} <= config.keys():
         raise ValueError(f"{folder} holds no run: its config.json names no environment and settings")
+    settings = config["settings"]
+    for old in RENAMED.keys() & settings.keys():
+        settings[RENAMED[old]] = settings.pop(old)
     return config
 
 

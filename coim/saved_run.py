@@ -45,7 +45,7 @@ class SavedRun:
     Attributes:
         folder: of the run.
         environment: name of the body.
-        settings: every setting, as ``config.json`` has it.
+        settings: every setting of ``config.json``, under its name of today.
         bodies: K of them, with the run's task and length of an episode, ready to be reset with designs.
         population: pi_Pop and Q_Pop, which serve every design.
         individual: pi_Ind and Q_Ind of the last design that has an episode in the checkpoint; see `policy_of` for the

@@ -23,7 +23,7 @@ TINY = Settings(
     episode_steps=6,
     individual_updates=1,
     population_updates=1,
-    designs="none",
+    imagine="none",
     threads=1,
     quiet=True,
 )

@@ -18,7 +18,7 @@ SETTINGS = {
     "num_runs": 1,
     "episode_steps": 10,
     "gamma": 0.9,
-    "designs": "known",
+    "imagine": "known",
     "individual_updates": 5,
     "population_updates": 3,
     "model_updates": 2,

@@ -88,7 +88,7 @@ def test_the_same_seed_repeats_and_another_does_not(tmp_path: Path) -> None:
 
 def test_the_baseline_differs_from_the_method_by_imagination_alone(tmp_path: Path) -> None:
     for designs in ("known", "none"):
-        run(tmp_path / designs, "--designs", designs, "--quiet")
+        run(tmp_path / designs, "--imagine", designs, "--quiet")
     ours, theirs = (read(tmp_path / designs / "evaluations.csv") for designs in ("known", "none"))
     # Until the population has learnt for the first time, nothing that was imagined reaches anything.
     assert ours[0]["training_return"] == theirs[0]["training_return"]
@@ -100,14 +100,14 @@ def test_the_baseline_differs_from_the_method_by_imagination_alone(tmp_path: Pat
 
 
 def test_runs_in_lock_step_have_a_row_each(tmp_path: Path) -> None:
-    run(tmp_path / "fleet", "--num-runs", "3", "--designs", "noisy", "--task", "backward", "--quiet")
+    run(tmp_path / "fleet", "--num-runs", "3", "--imagine", "noisy", "--task", "backward", "--quiet")
     designs = read(tmp_path / "fleet" / "designs.csv")
     assert [row["run"] for row in designs] == ["0", "1", "2"] * 7
     assert len({row["xi_torso"] for row in designs if row["kind"] == "random"}) == 3
 
 
 def test_the_baseline_imagines_nothing_and_quiet_is_quiet(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run(tmp_path / "run", "--designs", "none", "--quiet")
+    run(tmp_path / "run", "--imagine", "none", "--quiet")
     assert {row["model_error"] for row in read(tmp_path / "run" / "evaluations.csv")} == {""}
     assert capsys.readouterr().out == ""
 
@@ -128,8 +128,8 @@ def test_offline_wandb_needs_no_account(tmp_path: Path, monkeypatch: pytest.Monk
         (["--num-runs", "0"], "--num-runs is 0, it must be at least 1"),
         (["--first-episodes", "0"], "--first-episodes is 0, it must be at least 1"),
         (["--threads", "-1"], "--threads is -1, it must be at least 0"),
-        (["--sigma", "-1", "--designs", "noisy"], "sigma is -1"),
-        (["--sigma", "nan", "--designs", "noisy"], "sigma is nan"),
+        (["--sigma", "-1", "--imagine", "noisy"], "sigma is -1"),
+        (["--sigma", "nan", "--imagine", "noisy"], "sigma is nan"),
         (["--mix", "stirred"], "stirred"),
         (["--no-such-option"], "no-such-option"),
         (["--preset", "slow"], "slow"),
@@ -180,8 +180,8 @@ def test_the_papers_numbers_are_the_defaults() -> None:
 
 
 def test_the_simulator_imagines_and_no_model_is_learnt(tmp_path: Path) -> None:
-    run(tmp_path / "oracle", "--designs", "random", "--dream", "simulator", "--num-designs", "2", "--quiet")
-    run(tmp_path / "none", "--designs", "none", "--num-designs", "2", "--quiet")
+    run(tmp_path / "oracle", "--imagine", "random", "--dream", "simulator", "--num-designs", "2", "--quiet")
+    run(tmp_path / "none", "--imagine", "none", "--num-designs", "2", "--quiet")
     ours, theirs = (read(tmp_path / name / "evaluations.csv") for name in ("oracle", "none"))
     assert [row["model_error"] for row in ours] == [""] * 2
     assert "model/loss_dynamics" not in read(tmp_path / "oracle" / "metrics.csv")[0]
@@ -193,7 +193,7 @@ def test_the_simulator_imagines_and_no_model_is_learnt(tmp_path: Path) -> None:
 def test_impossible_pairs_are_counted_in_the_tables_and_matched_states_have_none(tmp_path: Path) -> None:
     shares = {}
     for states in ("stored", "matched"):
-        how = ("--designs", "random", "--imagined-states", states, "--value-states", states)
+        how = ("--imagine", "random", "--imagined-states", states, "--value-states", states)
         run(tmp_path / states, *how, "--num-designs", "4", "--quiet")
         shares[states] = [float(row["impossible"]) for row in read(tmp_path / states / "metrics.csv")]
     assert shares["matched"] == [0] * 4
@@ -201,16 +201,16 @@ def test_impossible_pairs_are_counted_in_the_tables_and_matched_states_have_none
 
 
 def test_a_governed_run_whose_model_has_learnt_too_little_is_the_baseline(tmp_path: Path) -> None:
-    how = ("--designs", "random", "--imagined-states", "matched", "--anchored", "--governed")
+    how = ("--imagine", "random", "--imagined-states", "matched", "--anchored", "--governed")
     run(tmp_path / "governed", *how, "--num-designs", "3", "--quiet")
-    run(tmp_path / "none", "--designs", "none", "--num-designs", "3", "--quiet")
+    run(tmp_path / "none", "--imagine", "none", "--num-designs", "3", "--quiet")
     ours, theirs = (read(tmp_path / name / "evaluations.csv") for name in ("governed", "none"))
     assert [row["return"] for row in ours] == [row["return"] for row in theirs]
     assert [float(row["imagined_share"]) for row in read(tmp_path / "governed" / "metrics.csv")] == [0, 0, 0]
 
 
 def test_a_fixed_body_is_marked_as_such(tmp_path: Path) -> None:
-    run(tmp_path / "fixed", "--designs", "none", "--bodies", "fixed", "--quiet")
+    run(tmp_path / "fixed", "--imagine", "none", "--bodies", "fixed", "--quiet")
     designs = read(tmp_path / "fixed" / "designs.csv")
     assert [row["kind"] for row in designs] == ["fixed"] * 7
     assert all(float(row[name]) == 1 for row in designs for name in XI)
@@ -219,8 +219,8 @@ def test_a_fixed_body_is_marked_as_such(tmp_path: Path) -> None:
 
 def test_a_simulator_without_designs_to_imagine_is_refused(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
-        parse("hopper", "", ["--dream", "simulator", "--designs", "none"])
-    assert "nothing to imagine with" in capsys.readouterr().err
+        parse("hopper", "", ["--dream", "simulator", "--imagine", "none"])
+    assert "imagines nothing with" in capsys.readouterr().err
 
 
 def test_a_body_may_have_more_first_designs_than_the_papers(tmp_path: Path) -> None:

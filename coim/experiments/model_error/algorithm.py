@@ -212,7 +212,7 @@ def other_learner(algorithm: CoAdaptation, **settings: Any) -> DynamicsLearner:
         ValueError: if the algorithm learns no model.
     """
     if algorithm.dynamics is None:
-        raise ValueError("this run learns no model to measure; let an ensemble imagine, as with --designs known")
+        raise ValueError("this run learns no model to measure; let an ensemble imagine, as with --imagine known")
     twin = deepcopy(algorithm.dynamics.ensemble)
     twin.predict = "next" if twin.predict == "delta" else "delta"
     return DynamicsLearner(twin, num_runs=twin.num_runs, **settings)

@@ -38,7 +38,7 @@ def folders_with(study: Path, file: str) -> dict[Kind, list[Path]]:
     for folder in sorted(path.parent for path in (study / FOLDER).rglob(file)):
         config = read_config(folder)
         settings = config["settings"]
-        kind = Kind(config["environment"], settings.get("task", USUAL[0]), settings.get("designs", USUAL[1]))
+        kind = Kind(config["environment"], settings.get("task", USUAL[0]), settings.get("imagine", USUAL[1]))
         found.setdefault(kind, []).append(folder)
     return dict(sorted(found.items()))
 

@@ -142,11 +142,11 @@ def episodes_of_designs(body: type[MorphEnv], settings: Settings) -> list[int]:
 
 def make_generator(env: MorphEnv, settings: Settings) -> DesignGenerator | None:
     """G by its name on the command line."""
-    if settings.designs == "none":
+    if settings.imagine == "none":
         return None
-    if settings.designs == "noisy":
+    if settings.imagine == "noisy":
         return NoisyDesigns(env.design_spec, sigma=settings.sigma)
-    return KnownDesigns() if settings.designs == "known" else RandomDesigns(env.design_spec)
+    return KnownDesigns() if settings.imagine == "known" else RandomDesigns(env.design_spec)
 
 
 def make_search(env: MorphEnv, settings: Settings, *, seed: int) -> DesignSearch:

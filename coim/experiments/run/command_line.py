@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import tyro
 from coim.experiments.run.effect import refuse_without_effect
 from coim.experiments.run.resume import refuse_changes, saved_settings
 from coim.experiments.run.settings import PRESETS, Settings, check, given, option
+from coim.run_folder import RENAMED
 
 
 def parse(
@@ -28,6 +30,7 @@ def parse(
         SystemExit: on an unknown option or value, or one that would change nothing, with a sentence on standard error.
         ValueError: if the folder to resume holds no run, or a setting was changed that its past depends on.
     """
+    arguments = renamed(sys.argv[1:] if arguments is None else arguments)
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="paper")
     first.add_argument("--resume", type=Path)
@@ -44,3 +47,20 @@ def parse(
     if known.resume is not None:
         refuse_changes(default, settings)
     return settings
+
+
+def renamed(words: Sequence[str]) -> list[str]:
+    """Words of a command line with today's names of options, after a warning for each old one.
+
+    Example:
+        >>> renamed(["--imagine", "none", "--seed=3"])
+        ['--imagine', 'none', '--seed=3']
+    """
+    found = list(words)
+    for index, word in enumerate(found):
+        name, *value = word.split("=", 1)
+        if name.removeprefix("--") in RENAMED and name.startswith("--"):
+            now = option(RENAMED[name.removeprefix("--")])
+            print(f"warning: {name} is called {now} now; the next release knows {now} alone", file=sys.stderr)
+            found[index] = "=".join([now, *value])
+    return found

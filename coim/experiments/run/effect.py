@@ -16,8 +16,8 @@ IMAGINATION = ("dream", "sigma", "imagined_share", "individual_imagined_share", 
 RULES: tuple[tuple[tuple[str, ...], Callable[[Settings], bool], str], ...] = (
     (("search", *SWARM), lambda settings: settings.bodies != "search", "bodies"),
     (SWARM, lambda settings: settings.search == "gradient", "search"),
-    (IMAGINATION, lambda settings: settings.designs == "none", "designs"),
-    (("sigma",), lambda settings: settings.designs != "noisy", "designs"),
+    (IMAGINATION, lambda settings: settings.imagine == "none", "imagine"),
+    (("sigma",), lambda settings: settings.imagine != "noisy", "imagine"),
     (MODEL, lambda settings: settings.dream == "simulator", "dream"),
     (
         ("sigma", *ROWS),
@@ -37,7 +37,7 @@ def without_effect(settings: Settings, *, called: Callable[[str], str] = str) ->
 
     Example:
         >>> from coim.experiments.run.settings import Settings
-        >>> without_effect(Settings(search="gradient", designs="noisy"))["num_particles"]
+        >>> without_effect(Settings(search="gradient", imagine="noisy"))["num_particles"]
         'num_particles has no effect with search gradient; leave it out'
     """
     found: dict[str, str] = {}

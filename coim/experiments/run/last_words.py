@@ -25,7 +25,7 @@ def plain_sac(settings: Settings, design: Sequence[float], **changed: Any) -> Se
         design: the body, ``[D]``.
         changed: settings that are to have other values besides.
     """
-    alone: dict[str, Any] = {"designs": "none", "dream": "ensemble", "bodies": "search", "num_designs": 1}
+    alone: dict[str, Any] = {"imagine": "none", "dream": "ensemble", "bodies": "search", "num_designs": 1}
     alone |= {"num_runs": 1, "population_updates": 0, "model_updates": 0}
     alone |= {"individual_mix": 0.0, "individual_imagined_share": 0.0}
     alone |= {"out": None, "resume": None, "name": "retrained", "wandb": "off"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -21,8 +20,8 @@ class Settings:
     """paper: Sec. 6.1. quick: the same body and networks with fewer designs, episodes and updates, for a first look."""
     task: Literal["forward", "backward"] = "forward"
     """Which way the speed in the reward counts (Fig. 1, first and second row)."""
-    designs: Literal["known", "noisy", "random", "none"] = "known"
-    """G, the designs that are imagined: as stored, with noise, uniform, or none (the model-free baseline)."""
+    imagine: Literal["known", "noisy", "random", "none"] = "known"
+    """Designs to imagine: those tried, those with noise, uniform ones, or none (the model-free baseline)."""
     dream: Literal["ensemble", "simulator"] = "ensemble"
     """Who imagines: the learnt ensemble, or the simulator itself, which tells the ensemble's error from the rest."""
     bodies: Literal["search", "random", "fixed"] = "search"
@@ -185,14 +184,13 @@ def option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def given(arguments: Sequence[str] | None) -> set[str]:
-    """Names of the settings that are written on a command line, None for this process's.
+def given(words: Sequence[str]) -> set[str]:
+    """Names of the settings that are written on a command line.
 
     Example:
         >>> sorted(given(["--search", "gradient", "--num_particles=5", "--no-compile"]))
         ['compile', 'num_particles', 'search']
     """
-    words = sys.argv[1:] if arguments is None else arguments
     written = {word[2:].split("=")[0].replace("-", "_") for word in words if word.startswith("--")}
     return {name for name in kinds_of(Settings) if {name, f"no_{name}"} & written}
 
@@ -219,10 +217,9 @@ def check(settings: Settings, *, called: Callable[[str], str] = str) -> None:
     for name in ("num_cells", "model_cells"):
         if not getattr(settings, name):
             raise ValueError(f"{called(name)} is empty, it must have at least one number; the defaults have three")
-    if settings.dream == "simulator" and settings.designs == "none":
+    if settings.dream == "simulator" and settings.imagine == "none":
         raise ValueError(
-            f"{called('dream')} simulator has nothing to imagine with {called('designs')} none; take known, noisy or "
-            "random"
+            f"{called('dream')} simulator imagines nothing with {called('imagine')} none; take known, noisy or random"
         )
     if settings.dream == "simulator" and settings.governed:
         raise ValueError(

@@ -68,7 +68,7 @@ def measure(run: Run, failure: float) -> Measured:
         chosen = []  # of one body alone there is nothing to rank
     settings, rows = run.record.settings, [row for row in run.record.episodes if row["run"] == run.number]
     an_episode = settings["individual_updates"] + settings["population_updates"]
-    learns_model = settings["designs"] != "none" and settings.get("dream") != "simulator"
+    learns_model = settings["imagine"] != "none" and settings.get("dream") != "simulator"
     an_episode += settings["model_updates"] * learns_model
     return Measured(
         run,

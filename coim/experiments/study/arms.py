@@ -41,7 +41,7 @@ class Arm:
 
     Example:
         >>> ARMS["noisy"].settings, ARMS["noisy"].baselines
-        ({'designs': 'noisy'}, ('none', 'known'))
+        ({'imagine': 'noisy'}, ('none', 'known'))
     """
 
     name: str
@@ -107,7 +107,7 @@ ARMS = by_name(
     Arm(
         name="none",
         words="imagines nothing: the model-free baseline",
-        settings={"designs": "none"},
+        settings={"imagine": "none"},
         baselines=(),
         family="imagination",
         colour=BLUE,
@@ -116,7 +116,7 @@ ARMS = by_name(
     Arm(
         name="known",
         words="imagines the designs tried so far",
-        settings={"designs": "known"},
+        settings={"imagine": "known"},
         baselines=("none",),
         family="imagination",
         colour=VERMILION,
@@ -125,7 +125,7 @@ ARMS = by_name(
     Arm(
         name="noisy",
         words="imagines the designs tried so far with noise added",
-        settings={"designs": "noisy"},
+        settings={"imagine": "noisy"},
         baselines=("none", "known"),  # unseen designs against seen ones
         family="imagination",
         colour=ORANGE,
@@ -134,7 +134,7 @@ ARMS = by_name(
     Arm(
         name="random",
         words="imagines uniformly random designs",
-        settings={"designs": "random"},
+        settings={"imagine": "random"},
         baselines=("none", "known"),
         family="imagination",
         colour=BLACK,
@@ -143,7 +143,7 @@ ARMS = by_name(
     Arm(
         name="oracle",
         words="imagines uniformly random designs, with the simulator in place of the model",
-        settings={"designs": "random", "dream": "simulator"},
+        settings={"imagine": "random", "dream": "simulator"},
         baselines=("none", "random"),  # the same impossible pairs of state and body, without the error of a model
         family="imagination",
         colour=PURPLE,
@@ -152,7 +152,7 @@ ARMS = by_name(
     Arm(
         name="control-only",
         words="imagines nothing and keeps one body",
-        settings={"designs": "none", "bodies": "fixed"},
+        settings={"imagine": "none", "bodies": "fixed"},
         baselines=("none",),
         family="bodies",
         colour=GREY,
@@ -161,7 +161,7 @@ ARMS = by_name(
     Arm(
         name="random-bodies",
         words="imagines nothing and builds random bodies only",
-        settings={"designs": "none", "bodies": "random"},
+        settings={"imagine": "none", "bodies": "random"},
         baselines=("none",),
         family="bodies",
         colour=GREEN,

@@ -45,7 +45,7 @@ PROTOCOLS: dict[str, Settings] = {
     ),
 }
 # Of the cell or of the machine that it runs on, never of a study.
-OF_THE_CELL = {"preset", "task", "designs", "bodies", "dream", "seed", "num_runs", "threads"}
+OF_THE_CELL = {"preset", "task", "imagine", "bodies", "dream", "seed", "num_runs", "threads"}
 OF_THE_CELL |= {"out", "resume", "name", "quiet"}
 
 

@@ -112,7 +112,7 @@ def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Pat
 
 def settings_of(study: Path, cell: str, **values: object) -> Settings:
     """Give a made-up cell every setting of a run."""
-    settings = parse("test", "", tiny("--designs", "random", "--individual-imagined-share", "0.5", "--lr", "0.001"))
+    settings = parse("test", "", tiny("--imagine", "random", "--individual-imagined-share", "0.5", "--lr", "0.001"))
     config = {"environment": "hopper", "settings": plain(settings) | values}
     (study / "cells" / cell / "config.json").write_text(json.dumps(config))
     return settings
@@ -123,7 +123,7 @@ def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_on
     settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
     lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
     own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
-    assert (own.designs, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
+    assert (own.imagine, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
     assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
     assert (own.first_design, own.first_episodes) == ((0.75, 1), 9)
     assert (own.lr, own.batch_size, own.individual_updates) == (0.001, settings.batch_size, settings.individual_updates)
@@ -142,7 +142,7 @@ def test_designs_are_retrained_once_and_drawn(
     )  # on the cluster there is
     for arm in ("none", "known"):
         folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
-        experiment.main(HopperMorph, "hopper", tiny("--designs", arm, "--quiet", "--out", str(folder)))
+        experiment.main(HopperMorph, "hopper", tiny("--imagine", arm, "--quiet", "--out", str(folder)))
     with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
         main([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
     capsys.readouterr()

@@ -112,7 +112,7 @@ def watch(folder: Path, *options: str, **environment: str) -> subprocess.Complet
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(tmp_path_factory.mktemp("fleet") / "run", num_runs=2, num_designs=3, designs="none", episode_steps=60)
+    return run(tmp_path_factory.mktemp("fleet") / "run", num_runs=2, num_designs=3, imagine="none", episode_steps=60)
 
 
 def test_what_is_filmed_is_the_evaluation_with_the_best_return(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:

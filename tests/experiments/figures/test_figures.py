@@ -27,7 +27,7 @@ DRAWN += ["statistics_predictions", "statistics_runs"]
 def study(tmp_path: Path) -> Path:
     """Hopper, two arms with four and three runs, one of which diverged and one is under way."""
     for seed, last in enumerate((1.0, 2.0, 4.0, 9.0)):
-        write_cell(tmp_path, f"hopper-forward-none-{seed}", [10, 20, 30, last], designs="none")
+        write_cell(tmp_path, f"hopper-forward-none-{seed}", [10, 20, 30, last], imagine="none")
     write_cell(tmp_path, "hopper-forward-known-0", [12, 22, 32, 42])
     write_cell(tmp_path, "hopper-forward-known-1", [14, 24], diverged=[0])
     write_cell(tmp_path, "hopper-forward-known-2", [10, 14, 40])

@@ -198,7 +198,7 @@ def test_a_run_that_nobody_measured_and_one_without_a_model_are_refused(tmp_path
     with pytest.raises(SystemExit, match="nothing was measured in the run"):
         measure(tmp_path / "alone")
     with pytest.raises(SystemExit, match="learns no model"):
-        main(["hopper", "--preset", "quick", "--designs", "none", "--out", str(tmp_path / "none")])
+        main(["hopper", "--preset", "quick", "--imagine", "none", "--out", str(tmp_path / "none")])
 
 
 def test_too_few_designs_for_two_components_are_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -89,14 +89,14 @@ def test_a_lone_run_has_neither_a_mean_nor_an_interval(tmp_path: Path) -> None:
 
 
 def test_tasks_environments_and_ways_to_imagine_have_figures_of_their_own(tmp_path: Path) -> None:
-    write_measured(tmp_path, "a", [2.0], task="forward", designs="known")
-    write_measured(tmp_path, "b", [4.0], task="backward", designs="known")
-    write_measured(tmp_path, "c", [6.0], task="backward", designs="known", environment="walker")
+    write_measured(tmp_path, "a", [2.0], task="forward", imagine="known")
+    write_measured(tmp_path, "b", [4.0], task="backward", imagine="known")
+    write_measured(tmp_path, "c", [6.0], task="backward", imagine="known", environment="walker")
     drawn = {plot.name: lines_of(plot, 0, "seen")[0][0][1] for plot in model_error.plots(tmp_path)}
     stem = "figure_4a_model_error"
     expected = {f"{stem}_hopper_backward": 2.0, f"{stem}_hopper_forward": 1.0, f"{stem}_walker_backward": 3.0}
     assert drawn == expected
-    write_measured(tmp_path, "d", [8.0], task="forward", designs="noisy")
+    write_measured(tmp_path, "d", [8.0], task="forward", imagine="noisy")
     names = [plot.name for plot in model_error.plots(tmp_path)]
     assert names[1:3] == [f"{stem}_hopper_forward_known", f"{stem}_hopper_forward_noisy"]
 

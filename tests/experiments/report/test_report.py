@@ -84,7 +84,7 @@ def check(path: Path) -> Page:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Finished tiny runs: "one", "fleet" of three and "free", a fleet of two without imagination."""
     folder = tmp_path_factory.mktemp("runs")
-    options = {"one": [], "fleet": ["--num-runs", "3"], "free": ["--num-runs", "2", "--designs", "none"]}
+    options = {"one": [], "fleet": ["--num-runs", "3"], "free": ["--num-runs", "2", "--imagine", "none"]}
     for name, more in options.items():
         experiment.main(HopperMorph, "hopper", tiny("--quiet", "--out", str(folder / name), *more))
     return folder

@@ -25,7 +25,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("settings", "stops"),
-    [({}, [0, 5]), ({"num_runs": 2, "designs": "noisy", "threads": 2}, [2, SAVES - 1])],
+    [({}, [0, 5]), ({"num_runs": 2, "imagine": "noisy", "threads": 2}, [2, SAVES - 1])],
     ids=["one", "fleet"],
 )
 def test_a_run_that_was_cut_anywhere_goes_on_as_the_whole_one(

@@ -93,7 +93,7 @@ def test_without_a_return_there_is_no_best_body(tmp_path: Path) -> None:
 
 
 def test_plain_sac_trains_one_body_and_imagines_nothing() -> None:
-    alone = plain_sac(Settings(designs="noisy", num_runs=4), (1.0, 1.5, 1.0, 1.0), seed=9)
+    alone = plain_sac(Settings(imagine="noisy", num_runs=4), (1.0, 1.5, 1.0, 1.0), seed=9)
     assert first_designs(HopperMorph, alone) == [(1.0, 1.5, 1.0, 1.0)]
-    assert (alone.designs, alone.num_designs, alone.num_runs, alone.population_updates) == ("none", 1, 1, 0)
+    assert (alone.imagine, alone.num_designs, alone.num_runs, alone.population_updates) == ("none", 1, 1, 0)
     assert (alone.seed, alone.individual_updates) == (9, Settings.individual_updates)

@@ -19,7 +19,7 @@ from coim.experiments.report.summary_png import draw_run
 from coim.experiments.run.records import read_record
 from tests.experiments.report.test_report import check
 
-FLEET = {"num_runs": 3, "designs": "noisy"}
+FLEET = {"num_runs": 3, "imagine": "noisy"}
 
 
 def read(path: Path) -> list[dict[str, str]]:

@@ -26,6 +26,7 @@ from coim.experiments.run.replay_file import ReplayFile
 from coim.experiments.run.settings import LATER
 from coim.experiments.train import main
 from coim.products import Choice
+from coim.run_folder import read_config
 
 
 @pytest.fixture(scope="module")
@@ -108,11 +109,19 @@ def test_a_run_that_was_begun_before_a_setting_was_there_goes_on(tmp_path: Path,
     begun_by = config.pop("products")
     for name in LATER:
         del config["settings"][name]
+    config["settings"]["designs"] = config["settings"].pop("imagine")
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("coim.experiments.train.FORMERLY", Choice(**begun_by))  # what a machine has, whichever this is
         resume(folder)
     assert soak.differences(whole, folder) == []
+
+
+def test_settings_of_earlier_runs_are_read_under_their_names_of_today() -> None:
+    cells = Path(__file__).parents[3] / "docs/results/preview/cells"
+    config = json.loads((cells / "hopper-forward-noisy-0" / "config.json").read_text())
+    assert "imagine" not in config["settings"]
+    assert read_config(cells / "hopper-forward-noisy-0")["settings"]["imagine"] == "noisy"
 
 
 def test_other_packages_are_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

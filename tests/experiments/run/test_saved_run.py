@@ -33,7 +33,7 @@ def make(folder: Path, **settings: object) -> Made:
 
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return make(tmp_path_factory.mktemp("single") / "run", designs="none", num_designs=1)
+    return make(tmp_path_factory.mktemp("single") / "run", imagine="none", num_designs=1)
 
 
 @pytest.fixture(scope="module")

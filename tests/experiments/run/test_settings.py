@@ -47,13 +47,13 @@ WRONG: list[tuple[str, Any, str]] = [
     ("num_designs", 0, "num_designs is 0, it must be at least 1"),
     ("first_design", (1, -1), "first_design is (1.0, -1.0), each must be above 0"),
     ("sigma", -1, "sigma is -1.0, it must be at least 0"),
-    ("dream", "simulator", "dream simulator has nothing to imagine with designs none; take known, noisy or random"),
+    ("dream", "simulator", "dream simulator imagines nothing with imagine none; take known, noisy or random"),
 ]
 
 
 @pytest.mark.parametrize(("name", "value", "sentence"), WRONG)
 def test_a_value_that_no_run_can_have_is_named_with_what_it_must_be(name: str, value: object, sentence: str) -> None:
-    fields: dict[str, Any] = {"designs": "none", name: value}
+    fields: dict[str, Any] = {"imagine": "none", name: value}
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         check(Settings(**fields))
     assert sentence in str(refused.value)
@@ -80,8 +80,8 @@ def test_no_number_is_without_a_limit() -> None:
         (["--num-cells", "8", "0"], "error: --num-cells is (8, 0), each must be at least 1\n"),
         (["--individual-imagined-share", "2"], "error: --individual-imagined-share is 2.0, it must lie in [0, 1]\n"),
         (
-            ["--dream", "simulator", "--designs", "none"],
-            "error: --dream simulator has nothing to imagine with --designs none; take known, noisy or random\n",
+            ["--dream", "simulator", "--imagine", "none"],
+            "error: --dream simulator imagines nothing with --imagine none; take known, noisy or random\n",
         ),
         (
             ["--dream", "simulator", "--governed"],
@@ -89,8 +89,8 @@ def test_no_number_is_without_a_limit() -> None:
             "out\n",
         ),
         (
-            ["--designs", "none", "--anchored"],
-            "error: --anchored has no effect with --designs none; leave it out\n",
+            ["--imagine", "none", "--anchored"],
+            "error: --anchored has no effect with --imagine none; leave it out\n",
         ),
         (
             ["--search", "gradient", "--num-particles", "700"],
@@ -104,10 +104,10 @@ def test_no_number_is_without_a_limit() -> None:
             ["--bodies", "fixed", "--search", "swarm"],
             "error: --search has no effect with --bodies fixed; leave it out\n",
         ),
-        (["--sigma", "0.2"], "error: --sigma has no effect with --designs known; leave it out\n"),
+        (["--sigma", "0.2"], "error: --sigma has no effect with --imagine known; leave it out\n"),
         (
-            ["--designs", "none", "--model-cells", "8"],
-            "error: --model-cells has no effect with --designs none; leave it out\n",
+            ["--imagine", "none", "--model-cells", "8"],
+            "error: --model-cells has no effect with --imagine none; leave it out\n",
         ),
         (
             ["--dream", "simulator", "--predict", "next"],
@@ -131,9 +131,16 @@ def test_the_command_line_calls_a_setting_by_its_option(
 
 def test_what_has_an_effect_is_taken_and_so_is_a_default_that_has_none() -> None:
     assert parse("prog", "", ["--search", "gradient"]).num_particles == 700
-    assert parse("prog", "", ["--designs", "noisy", "--sigma", "0.2"]).sigma == 0.2
-    assert parse("prog", "", ["--designs", "none", "--individual-mix", "0.1"]).individual_mix == 0.1
+    assert parse("prog", "", ["--imagine", "noisy", "--sigma", "0.2"]).sigma == 0.2
+    assert parse("prog", "", ["--imagine", "none", "--individual-mix", "0.1"]).individual_mix == 0.1
     assert parse("prog", "", ["--sigma", "0.2"], read=("sigma",)).sigma == 0.2  # a program's own use
+
+
+def test_the_old_name_of_an_option_is_taken_with_a_warning(capsys: pytest.CaptureFixture) -> None:
+    assert parse("prog", "", ["--designs", "noisy", "--sigma", "0.2"]).imagine == "noisy"
+    assert parse("prog", "", ["--designs=none"]).imagine == "none"
+    warned = "warning: --designs is called --imagine now; the next release knows --imagine alone\n"
+    assert capsys.readouterr().err == 2 * warned
 
 
 def test_rules_are_about_settings() -> None:

@@ -86,7 +86,7 @@ def test_first_designs_and_a_body_that_never_changes_say_nothing_of_the_ranking(
 
 
 def test_who_learns_no_model_has_no_updates_of_it(tmp_path: Path) -> None:
-    write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], designs="none")
+    write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], imagine="none")
     write_cell(tmp_path, "hopper-forward-oracle-0", [10, 40, 20, 30], dream="simulator")
     assert [measure(run, failure=0).updates for run in read_runs(tmp_path).found] == [8 * (5 + 3)] * 2
 

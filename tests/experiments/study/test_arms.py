@@ -15,7 +15,7 @@ from tests.experiments.made_up_study import read_table, write_cell
 MADE_UP = Arm(
     name="made-up",
     words="imagines the designs tried so far, twice",
-    settings={"designs": "known", "mix": "sum"},
+    settings={"imagine": "known", "mix": "sum"},
     baselines=("none", "known"),
     family="imagination",
     colour="#123456",

@@ -45,7 +45,7 @@ def test_every_combination_is_a_cell_and_one_seed_of_all_arms_comes_before_the_n
 def test_arms_of_a_seed_differ_in_nothing_but_the_arm() -> None:
     cells = study(arms=tuple(ARMS), seeds=(5,), overrides={"lr": 0.1}).cells()
     assert len(cells) == 7
-    common = {"designs": "none", "bodies": "search", "dream": "ensemble"}
+    common = {"imagine": "none", "bodies": "search", "dream": "ensemble"}
     assert len({dataclasses.replace(cell.settings, **common) for cell in cells}) == 1
     assert len({cell.settings for cell in cells}) == 7
     assert {cell.settings.lr for cell in cells} == {0.1}
@@ -105,11 +105,11 @@ def test_an_override_that_changes_nothing_where_it_is_written_is_refused() -> No
     climbing = {"search": "gradient", "num_particles": 9}
     with pytest.raises(ValueError, match="in the overrides num_particles has no effect with search gradient"):
         study(overrides=climbing)
-    with pytest.raises(ValueError, match="sigma has no effect with designs none; leave it out"):
+    with pytest.raises(ValueError, match="sigma has no effect with imagine none; leave it out"):
         study(arms=("none", "oracle"), overrides={"sigma": 0.2})
     assert study(arms=("none", "noisy"), overrides={"sigma": 0.2}).overrides  # it has one in some of the cells
     more = Block(environments=("walker",), arms=("none",), seeds=(9,), overrides={"model_lr": 0.1})
-    with pytest.raises(ValueError, match="model_lr has no effect with designs none"):
+    with pytest.raises(ValueError, match="model_lr has no effect with imagine none"):
         study(arms=("known",), blocks=(more,))
 
 
