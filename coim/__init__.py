@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from coim.batches import batch_parts, sample_batches, sample_mixture
     from coim.buffers import Buffers, TransitionBuffer, transition_rows
     from coim.coadaptation import CoAdaptation
+    from coim.design_choice import DesignChoice, Situation
     from coim.designs import (
         DesignGenerator,
         DesignPosterior,
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
     from coim.episode import run_episode
     from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
+    from coim.governor import Governor
     from coim.imagination import imagine
+    from coim.imagined_replay import ImaginedReplay
     from coim.learners.dynamics import DynamicsLearner
     from coim.learners.sac import SACLearner
     from coim.models import (
@@ -46,6 +49,7 @@ if TYPE_CHECKING:
     from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
     from coim.run_folder import TriedDesign
     from coim.saved_run import Agent, SavedRun, load_run
+    from coim.updates import UpdatePlan
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -53,6 +57,7 @@ else:
             "batches": ["batch_parts", "sample_batches", "sample_mixture"],
             "buffers": ["Buffers", "TransitionBuffer", "transition_rows"],
             "coadaptation": ["CoAdaptation"],
+            "design_choice": ["DesignChoice", "Situation"],
             "designs": [
                 "DesignGenerator",
                 "DesignPosterior",
@@ -75,7 +80,9 @@ else:
             ],
             "episode": ["run_episode"],
             "events": ["DesignChosen", "DesignDone", "EpisodeDone", "Event"],
+            "governor": ["Governor"],
             "imagination": ["imagine"],
+            "imagined_replay": ["ImaginedReplay"],
             "learners.sac": ["SACLearner"],
             "models": [
                 "GaussianEnsemble",
@@ -89,6 +96,7 @@ else:
             ],
             "objectives": ["CoImSACLoss", "DesignValue", "EnsembleNLLLoss"],
             "saved_run": ["Agent", "SavedRun", "TriedDesign", "load_run"],
+            "updates": ["UpdatePlan"],
         },
     )
 
@@ -99,6 +107,7 @@ __all__ = [
     "Buffers",
     "CoAdaptation",
     "CoImSACLoss",
+    "DesignChoice",
     "DesignChosen",
     "DesignDone",
     "DesignGenerator",
@@ -110,9 +119,11 @@ __all__ = [
     "EpisodeDone",
     "Event",
     "GaussianEnsemble",
+    "Governor",
     "GradientSearch",
     "HalfCheetahMorph",
     "HopperMorph",
+    "ImaginedReplay",
     "KnownDesigns",
     "MorphEnv",
     "NetworkSizes",
@@ -124,10 +135,12 @@ __all__ = [
     "SACLearner",
     "SavedRun",
     "SimulatorDynamics",
+    "Situation",
     "StackedMLP",
     "TransitionBuffer",
     "TriedDesign",
     "TrustRegion",
+    "UpdatePlan",
     "WalkerMorph",
     "WorldModelEnv",
     "batch_parts",

@@ -1,6 +1,6 @@
 """The second loop of Algorithm 1: which body comes next.
 
-Shapes: K runs, D design.
+Shapes: I first designs, K runs, D design.
 
 References:
     "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Algorithm 1 and Eq. 5.
@@ -9,104 +9,240 @@ References:
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torchrl.data import Bounded
 
-from coim.designs import RandomDesigns
+from coim.agreement import check_counts, check_transfer, check_words
+from coim.buffers import Buffers
+from coim.designs import DesignSearch, RandomDesigns
 from coim.designs.search import Fitness
-from coim.events import Kind
+from coim.envs.morph import MorphEnv
+from coim.events import DesignChosen, DesignDone, Kind, Place
 from coim.learners.divergence import flat_fitness
+from coim.learners.sac import SACLearner
 from coim.models.stacked import select_run
 from coim.objectives.design import DesignValue
-
-if TYPE_CHECKING:
-    from coim.coadaptation import CoAdaptation
-
-
-def next_trial(algorithm: CoAdaptation) -> Trial:
-    """The next body of every run, before anything was learnt on it; a run that has diverged keeps the body that it has.
-
-    Args:
-        algorithm: between two bodies; its search and its generator of random designs move on.
-    """
-    kind, design, predicted = _next_design(algorithm)
-    frozen = [*algorithm.divergence.places]
-    if frozen:
-        design = design.clone()
-        design[frozen] = algorithm.buffers.ind[0]["design"][frozen].to(design.device)
-        predicted = None if predicted is None else algorithm.divergence.blank(predicted, (algorithm.index, 0))
-    best = torch.full(algorithm.env.batch_size, -torch.inf, dtype=torch.float32, device="cpu")
-    return Trial(kind, design, predicted, best=best)
+from coim.pairs import StatesAre
+from coim.randomness import restore_generator, stream
 
 
-def _next_design(algorithm: CoAdaptation) -> tuple[Kind, Tensor, Tensor | None]:
-    """First designs in order, then the optimum of Eq. 5 and a random design in turn; see ``bodies``."""
-    first = algorithm.first_designs
-    runs = algorithm.env.batch_size.numel()
-    since = algorithm.index - len(first)
-    if algorithm.bodies == "fixed":
-        design = first[0].expand(runs, -1)
-        return "fixed", design, _predict(algorithm, design)
-    if since < 0:
-        design = first[algorithm.index].expand(runs, -1)
-        return "first", design, _predict(algorithm, design)
-    if algorithm.bodies == "search" and since % 2 == 0:
-        found = [algorithm.search.maximise(fitness) for fitness in _fitness(algorithm)]
-        values = torch.tensor([value for _, value in found], dtype=torch.float32, device="cpu")
-        return "optimised", torch.stack([design for design, _ in found]), values
-    draw = RandomDesigns(algorithm.env.design_spec)
-    design = draw(first[:1].cpu().expand(runs, -1), rng=algorithm.rngs["designs"]).to(first.device)
-    return "random", design, _predict(algorithm, design)
-
-
-def _fitness(algorithm: CoAdaptation) -> list[Fitness]:
-    """Eq. 5 of each run, over the same draw of states; a run that has diverged has none to climb."""
-    buffers = algorithm.buffers
-    source = buffers.s0 if algorithm.value_over == "start" else buffers.pop
-    states = source.sample(algorithm.num_start_states).to(algorithm.device)
-    policy, qvalue = algorithm.population.policy, algorithm.population.qvalue
-    value = functools.partial(
-        DesignValue,
-        precision=algorithm.precision,
-        start_states_are=algorithm.value_states,
-        env=algorithm.env,
-    )
-    runs = algorithm.env.batch_size.numel()
-    if policy.num_runs is None:
-        return [value(policy, qvalue, states[:, 0])]
-    return [
-        value(select_run(policy, k), select_run(qvalue, k), states[:, k])
-        if k not in algorithm.divergence.places
-        else flat_fitness
-        for k in range(runs)
-    ]
-
-
-def _predict(algorithm: CoAdaptation, design: Tensor) -> Tensor | None:
-    """Eq. 5 of a design that was not searched for, ``[K]`` on the CPU; None before there is a start state."""
-    if len(algorithm.buffers.s0) == 0:
-        return None
-    return torch.stack([fitness(row.unsqueeze(0))[0] for fitness, row in zip(_fitness(algorithm), design)]).cpu()
-
-
-@dataclass
-class Trial:
-    """A body that is being tried: where the algorithm stands between two of its events.
+@dataclass(frozen=True)
+class Situation:
+    """Everything that the choice of a body may depend on, read between two bodies.
 
     Attributes:
-        kind: of the design.
-        design: ``[K, D]``.
-        predicted: Eq. 5 at this design when it was chosen, ``[K]`` on the CPU, or None.
-        best: highest evaluation return so far, ``[K]`` on the CPU; -inf of a run that has none, as one that
-            has diverged before.
-        next_episode: episodes that are over; with 0 the individual learner has not started yet.
+        index: of the design to choose, from 0.
+        env: the bodies.
+        population: learner that has seen all designs so far.
+        buffers: rows of all designs so far; ``s0`` has their start states, ``pop`` every state that was visited.
+        tried: designs whose episodes are over, in the order of building, each with its kind and its best return
+            ``[K]``. A run that was begun by version 0.1 has only those that came after it was resumed.
+        diverged: runs that have diverged, and where. They need no new body.
     """
 
-    kind: Kind
-    design: Tensor
-    predicted: Tensor | None
-    best: Tensor
-    next_episode: int = 0
+    index: int
+    env: MorphEnv
+    population: SACLearner
+    buffers: Buffers
+    tried: Sequence[DesignDone]
+    diverged: Mapping[int, Place]
+
+    @property
+    def num_runs(self) -> int:
+        """K."""
+        return self.buffers.s0.num_runs
+
+    @property
+    def present(self) -> Tensor:
+        """Bodies that the runs have now, ``[K, D]``; there are none before the first episode."""
+        return self.buffers.ind[0]["design"]
+
+
+class DesignChoice:
+    """Algorithm 1's choice: the first designs in order, then the optimum of Eq. 5 and a random design in turn.
+
+    Another way of choosing is a subclass. `fitness` says what the search maximises, `explore` what is tried in between;
+    both may read the whole `Situation`. What they draw or learn belongs into `state_dict`.
+
+    Args:
+        spec: bounds of one design, ``[D]``, as ``env.design_spec``.
+        first_designs: ``[I, D]`` bodies that every run tries first, on the device of the bodies.
+        search: maximises Eq. 5; needed if ``bodies`` is ``"search"``.
+        bodies: which come after the first ones. ``"search"`` is Algorithm 1, ``"random"`` never searches. ``"fixed"``
+            takes the first of the first designs every time, from the start on: the same budget for one body.
+        num_start_states: n, states that Eq. 5 averages over.
+        value_states: what they are under the query: ``"stored"`` (the paper's) or ``"matched"``; see
+            `coim.DesignValue`.
+        value_over: where they come from: the ``"start"`` of episodes (the paper's), or all that were ``"visited"`` so
+            far, a draw of Replay_Pop.
+        precision: of the networks' products in Eq. 5.
+        seed: seeds the random designs. It may be the algorithm's own: their numbers are independent of all others'.
+
+    Raises:
+        ValueError: if a word such as ``bodies`` is unknown, ``num_start_states`` is below 1, first designs have the
+            wrong shape, dtype or device, or they or the search leave the bounds.
+        TypeError: if the search has no method ``maximise``, or first designs are no tensor.
+
+    Example:
+        >>> from coim import HopperMorph, ParticleSwarm
+        >>> spec = HopperMorph(seed=0).design_spec
+        >>> choice = DesignChoice(spec, torch.ones(1, 4), search=ParticleSwarm(spec, seed=0), seed=0)
+        >>> choice.first_designs.shape
+        torch.Size([1, 4])
+    """
+
+    def __init__(
+        self,
+        spec: Bounded,
+        first_designs: Tensor,
+        *,
+        search: DesignSearch | None = None,
+        bodies: Literal["search", "random", "fixed"] = "search",
+        num_start_states: int = 36,
+        value_states: StatesAre = "stored",
+        value_over: Literal["start", "visited"] = "start",
+        precision: Literal["float32", "bfloat16"] = "float32",
+        seed: int = 0,
+    ) -> None:
+        check_words(
+            bodies=(bodies, ("search", "random", "fixed")),
+            value_states=(value_states, ("stored", "matched")),
+            value_over=(value_over, ("start", "visited")),
+            precision=(precision, ("float32", "bfloat16")),
+        )
+        check_counts({"num_start_states": num_start_states}, {})
+        _check_first_designs(spec, first_designs)
+        if bodies == "search" or search is not None:
+            _check_search(spec, search)
+        self.spec, self.first_designs, self.search, self.bodies = spec, first_designs, search, bodies
+        self.num_start_states, self.value_states, self.value_over = num_start_states, value_states, value_over
+        self.precision = precision
+        # On the CPU wherever the networks are: there the same seed gives the same bodies.
+        self.rng = stream("designs", seed)
+
+    def choose(self, situation: Situation) -> DesignChosen:
+        """Choose the next body of every run; one that has diverged keeps the body that it has."""
+        kind, design, predicted = self._next(situation)
+        if frozen := [*situation.diverged]:
+            design = design.clone()
+            design[frozen] = situation.present[frozen].to(design.device)
+            if predicted is not None:
+                predicted = predicted.clone()
+                predicted[frozen] = torch.nan
+        return DesignChosen(situation.index, kind, design, predicted, dict(situation.diverged))
+
+    def fitness(self, situation: Situation) -> list[Fitness]:
+        """Eq. 5 of each run, ``K`` of them, over the same draw of states.
+
+        A run that has diverged has nothing to climb.
+        """
+        buffers, policy, qvalue = situation.buffers, situation.population.policy, situation.population.qvalue
+        source = buffers.s0 if self.value_over == "start" else buffers.pop
+        states = source.sample(self.num_start_states).to(self.first_designs.device)
+        value = functools.partial(
+            DesignValue, precision=self.precision, start_states_are=self.value_states, env=situation.env
+        )
+        if policy.num_runs is None:
+            return [value(policy, qvalue, states[:, 0])]
+        return [
+            value(select_run(policy, k), select_run(qvalue, k), states[:, k])
+            if k not in situation.diverged
+            else flat_fitness
+            for k in range(situation.num_runs)
+        ]
+
+    def explore(self, situation: Situation) -> Tensor:
+        """Uniform designs, ``[K, D]``: the exploration step of Algorithm 1."""
+        like = self.first_designs[:1].cpu().expand(situation.num_runs, -1)
+        return RandomDesigns(self.spec)(like, rng=self.rng).to(self.first_designs.device)
+
+    def check_fits(self, env: MorphEnv) -> None:
+        """Refuse to choose among designs that the bodies cannot have.
+
+        Raises:
+            ValueError: if this one's bounds leave those of the bodies or are on another device, or states are to be
+                matched and the bodies cannot tell how high they stand.
+        """
+        _check_within("design_choice chooses", self.spec, env.design_spec)
+        if self.value_states == "matched":
+            check_transfer(env)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the random numbers and of the search, if it has one."""
+        save = getattr(self.search, "state_dict", None)
+        return {"search": None if save is None else save(), "rng": self.rng.get_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the one that :meth:`state_dict` was read from."""
+        restore_generator(self.rng, state_dict["rng"])
+        load = getattr(self.search, "load_state_dict", None)
+        if load is not None and state_dict["search"] is not None:
+            load(state_dict["search"])
+
+    def _next(self, situation: Situation) -> tuple[Kind, Tensor, Tensor | None]:
+        """The kind of the design, the designs ``[K, D]`` and what is predicted of them, ``[K]``."""
+        since = situation.index - len(self.first_designs)
+        if self.bodies == "search" and since >= 0 and since % 2 == 0:
+            assert self.search is not None
+            found = [self.search.maximise(fitness) for fitness in self.fitness(situation)]
+            values = torch.tensor([value for _, value in found], dtype=torch.float32, device="cpu")
+            return "optimised", torch.stack([design for design, _ in found]), values
+        kind: Kind
+        if self.bodies == "fixed":
+            kind, design = "fixed", self.first_designs[0].expand(situation.num_runs, -1)
+        elif since < 0:
+            kind, design = "first", self.first_designs[situation.index].expand(situation.num_runs, -1)
+        else:
+            kind, design = "random", self.explore(situation)
+        return kind, design, self._predict(situation, design)
+
+    def _predict(self, situation: Situation, design: Tensor) -> Tensor | None:
+        """The fitness of designs ``[K, D]`` that were not searched for, ``[K]``; None before there is a start state."""
+        if len(situation.buffers.s0) == 0:
+            return None
+        values = [fitness(row.unsqueeze(0))[0] for fitness, row in zip(self.fitness(situation), design)]
+        return torch.stack(values).cpu()
+
+
+def _check_first_designs(spec: Bounded, first_designs: Tensor) -> None:
+    """Refuse first designs that the bodies or the networks could not take; the last of them is built hours later."""
+    if not isinstance(first_designs, Tensor):
+        raise TypeError(f"first_designs is a {type(first_designs).__name__}; pass a Tensor")
+    low, high = spec.space.low, spec.space.high
+    if first_designs.ndim != 2 or first_designs.shape[1:] != spec.shape or not len(first_designs):
+        raise ValueError(
+            f"first_designs has shape {list(first_designs.shape)}, expected [I, {spec.shape[0]}] with at least one row"
+        )
+    if first_designs.device != low.device or first_designs.dtype != spec.dtype:
+        raise ValueError(
+            f"first_designs are {first_designs.dtype} on {first_designs.device}, the bodies take {spec.dtype} on "
+            f"{low.device}; move them by first_designs.to({str(low.device)!r}, {spec.dtype})"
+        )
+    if not ((low <= first_designs) & (first_designs <= high)).all():
+        raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")
+
+
+def _check_search(spec: Bounded, search: DesignSearch | None) -> None:
+    """Refuse a search that leaves the bounds; one without ``spec`` is believed."""
+    if isinstance(search, type) or not callable(getattr(search, "maximise", None)):
+        what = f"the class {search.__name__}" if isinstance(search, type) else f"a {type(search).__name__}"
+        raise TypeError(f"search is {what}; pass a DesignSearch, such as ParticleSwarm(env.design_spec, seed=0)")
+    if (own := getattr(search, "spec", None)) is not None:
+        _check_within("the search looks", own, spec)
+
+
+def _check_within(what: str, inner: Bounded, outer: Bounded) -> None:
+    """Refuse bounds that leave others, or that are elsewhere."""
+    own, bodies = inner.space, outer.space
+    alike = inner.shape == outer.shape and own.low.device == bodies.low.device
+    if not alike or (own.low < bodies.low).any() or (own.high > bodies.high).any():
+        raise ValueError(
+            f"{what} among designs of [{own.low.tolist()}, {own.high.tolist()}] on {own.low.device}, the bodies have "
+            f"those of [{bodies.low.tolist()}, {bodies.high.tolist()}] on {bodies.low.device}; make it with "
+            "env.design_spec"
+        )

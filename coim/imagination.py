@@ -87,7 +87,7 @@ def imagine(
         >>> rows["next", "reward"].shape
         torch.Size([51, 1])
     """
-    _check_options(dream, states_are, actions)
+    check_options(dream, states_are, actions)
     needed = REAL if anchored else (*SEEN, "action") if actions == "replayed" else SEEN
     missing = [key for key in needed if key not in states.keys(include_nested=True)]
     if missing or not states.batch_size.numel():
@@ -161,7 +161,7 @@ def _imagine_chunk(
     return TensorDict(row, states.batch_size, device=states.device)
 
 
-def _check_options(dream: WorldModelEnv, states_are: str, actions: str) -> None:
+def check_options(dream: WorldModelEnv, states_are: str, actions: str) -> None:
     """Refuse words that are unknown, and what the dream's bodies cannot do."""
     if states_are not in ("stored", "matched"):
         raise ValueError(f"states_are={states_are!r} is unknown; choose 'stored' or 'matched'")

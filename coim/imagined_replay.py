@@ -16,13 +16,19 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from coim.agreement import check_model, check_transfer, sizes_of
 from coim.batches import put_imagined, sample_batches
 from coim.buffers import TransitionBuffer
 from coim.designs import DesignGenerator
-from coim.envs.world_model import WorldModelEnv
+from coim.envs.morph import MorphEnv
+from coim.envs.world_model import AnchoredDynamics, WorldModelEnv
 from coim.governor import Governor
-from coim.imagination import Actions, imagine
+from coim.imagination import Actions, check_options, imagine
+from coim.learners.dynamics import DynamicsLearner
+from coim.models.ensemble import GaussianEnsemble
 from coim.pairs import StatesAre, impossible_pairs
+
+TRIES = 16  # draws of G from each design that is tried
 
 
 class ImaginedReplay:
@@ -31,11 +37,19 @@ class ImaginedReplay:
     Args:
         art: Replay_Art.
         dream: where transitions are imagined.
-        generator: G.
+        generator: G, the designs that are imagined.
         states_are: see :func:`coim.imagine`.
         anchored: see :func:`coim.imagine`.
         actions: see :func:`coim.imagine`.
-        governor: of the share of imagined rows; None leaves it to the settings.
+        governor: decides how much of a batch is imagined, run by run, from what is measured of the model. The planned
+            share is then the most, and a run that never earns any is the model-free baseline, to the last bit. None
+            imagines the planned share.
+
+    Raises:
+        TypeError: if the dream is no `WorldModelEnv`, G cannot be called, states are to be matched and the dream's
+            bodies have no ``transfer``, or rows are to be anchored and its model has no ``means``.
+        ValueError: if ``states_are`` or ``actions`` is unknown, or the bodies' lengths are not known as functions of
+            their designs and states are to be matched.
 
     Attributes:
         counts: whether impossible pairs are counted. Not where the bodies cannot tell how high they stand (see
@@ -53,6 +67,21 @@ class ImaginedReplay:
         actions: Actions = "fresh",
         governor: Governor | None = None,
     ) -> None:
+        if not isinstance(dream, WorldModelEnv):
+            raise TypeError(
+                f"the dream is a {type(dream).__name__}, and imagination asks its model itself; pass a WorldModelEnv, "
+                "which of a TransformedEnv is its base_env"
+            )
+        if not callable(generator):
+            raise TypeError(
+                f"the generator is a {type(generator).__name__}; pass a DesignGenerator, such as NoisyDesigns"
+            )
+        check_options(dream, states_are, actions)
+        if anchored and not isinstance(dream.ensemble, AnchoredDynamics):
+            raise TypeError(
+                f"a {type(dream.ensemble).__name__} has no means() to anchor with; give it one as AnchoredDynamics has "
+                "it, or leave anchored out"
+            )
         self.art, self.dream, self.generator = art, dream, generator
         self.states_are, self.anchored, self.actions = states_are, anchored, actions
         self.governor = governor
@@ -124,15 +153,66 @@ class ImaginedReplay:
         num_rows = (self.governor.shares(most) * batches.shape[1]).round().long()
         return put_imagined(batches, self.art, num_rows, rng=rng)
 
+    def check_fits(
+        self, env: MorphEnv, art: TransitionBuffer, dynamics: DynamicsLearner | None, first_designs: Tensor
+    ) -> None:
+        """Refuse to imagine for other bodies, into another buffer, or by a model of which nothing is learnt.
+
+        Args:
+            env: the bodies.
+            art: Replay_Art, from which learners draw.
+            dynamics: learner of the model, or None.
+            first_designs: ``[I, D]``, on which G is tried.
+
+        Raises:
+            ValueError: if the dream steps another ensemble than the one that learns or one that has learnt nothing, is
+                of other bodies or pays other rewards, the bodies cannot tell how high they stand and states are to be
+                matched, nothing is learnt that could be governed, or G leaves the bounds.
+        """
+        if art is not self.art:
+            raise ValueError("imagined rows go into another buffer than buffers.art; make both with the same one")
+        if self.governor is not None and (dynamics is None or self.governor.ensemble is not dynamics.ensemble):
+            raise ValueError(
+                "what is imagined is governed by the errors of the model that is learnt; give dynamics, and its "
+                "ensemble to the governor"
+            )
+        model = self.dream.ensemble
+        if isinstance(model, GaussianEnsemble):
+            if dynamics is not None and model is not dynamics.ensemble:
+                raise ValueError(
+                    "the dream steps another ensemble than the one that dynamics trains; make it with dynamics.ensemble"
+                )
+            if dynamics is None and not model.inputs.count.any():
+                raise ValueError(
+                    "the dream steps an ensemble that has seen nothing and that nobody trains; give its learner as "
+                    "dynamics"
+                )
+        _check_rewards(env, self.dream)
+        check_model(env, model)
+        if self.states_are == "matched":
+            check_transfer(env)
+        _check_generator(env, self.generator, first_designs)
+
     def state_dict(self) -> dict[str, Any]:
         """Return what the coming refreshes depend on, beside the buffers and the generators."""
         return {"counts": self.counts, "governor": None if self.governor is None else self.governor.state_dict()}
 
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on as the one that :meth:`state_dict` was read from."""
-        self.counts = self.counts and state_dict["counts"]
+    def load_state_dict(self, state_dict: Mapping[str, Any] | None) -> None:
+        """Go on as the one that :meth:`state_dict` was read from.
+
+        Args:
+            state_dict: None of a run that was begun before impossible pairs were counted. It goes on with the columns
+                that its tables have.
+
+        Raises:
+            ValueError: if only one of the two is governed.
+        """
+        state = state_dict or {"counts": False, "governor": None}
+        if (state["governor"] is None) != (self.governor is None):
+            raise ValueError("one of the state and the algorithm is governed and the other is not; make it alike")
+        self.counts = self.counts and state["counts"]
         if self.governor is not None:
-            self.governor.load_state_dict(state_dict["governor"])
+            self.governor.load_state_dict(state["governor"])
 
 
 def _clearance_is_known(dream: WorldModelEnv) -> bool:
@@ -145,3 +225,44 @@ def _clearance_is_known(dream: WorldModelEnv) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:
+    """Compare the rewards of dream and bodies on a few rows that stand for all."""
+    sizes = sizes_of(env), sizes_of(dream)
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"the dream has sizes {sizes[1]}, the bodies {sizes[0]}; make the dream of these bodies")
+    rng = torch.Generator("cpu").manual_seed(0)
+    observation, action, following, design = (
+        torch.randn(TRIES, sizes[0][key], generator=rng, dtype=torch.float32, device="cpu").to(env.device or "cpu")
+        for key in ("observation", "action", "observation", "design")
+    )
+    row = (observation, action.tanh(), following, design.sigmoid() + 0.5)
+    if not torch.allclose(dream.reward_fn(*row), env.reward_fn(*row)):
+        raise ValueError(
+            "the dream pays other rewards than the bodies: it was made of another body or task; make it of this env"
+        )
+
+
+def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: Tensor) -> None:
+    """Try G on the first designs and on two corners; torch's global generators stay as they are."""
+    low, high = env.design_spec.space.low, env.design_spec.space.high
+    tried = torch.cat([first_designs, low[None], high[None]]).repeat(TRIES, 1)
+    tried = tried.unsqueeze(1).expand(-1, env.batch_size.numel(), -1)  # [N, K, D]
+    with torch.random.fork_rng(devices=[tried.device] if tried.device.type == "cuda" else []):
+        found = generator(tried.clone(), rng=torch.Generator(tried.device).manual_seed(0))
+    if found.shape != tried.shape:
+        raise ValueError(
+            f"the generator makes designs {list(found.shape)} of designs {list(tried.shape)}; it must keep their shape"
+        )
+    if found.dtype != tried.dtype or found.device != tried.device:
+        raise ValueError(
+            f"the generator makes designs in {found.dtype} on {found.device}, of designs in {tried.dtype} on "
+            f"{tried.device}; it must keep both"
+        )
+    outside = ~((low <= found) & (found <= high)).all(-1)  # NaN is neither
+    if outside.any():
+        raise ValueError(
+            f"the generator makes {found[outside][0].tolist()} of {tried[outside][0].tolist()}, which leaves "
+            f"[{low.tolist()}, {high.tolist()}]; let it end with design_spec.project()"
+        )

@@ -9,9 +9,44 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
+
+# A new one goes to the end, so that the numbers of all others stay what they are.
+Stream = Literal[
+    "actions",
+    "dream",
+    "designs",
+    "individual",
+    "population",
+    "model",
+    "imagined states",
+    "imagined population",
+    "imagined individual",
+]
+"""Everything that Algorithm 1 draws: actions, imagination, random designs, and the rows of each learner's batches."""
+
+
+def stream(name: Stream, seed: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """Make the generator of one thing that is drawn.
+
+    Each has its own, so that no number depends on which is drawn first, or on whether another is drawn at all.
+
+    Args:
+        name: of what is drawn.
+        seed: the same for all names.
+        device: where the numbers are.
+
+    Example:
+        >>> one, other = stream("actions", 0), stream("designs", 0)
+        >>> bool(torch.rand((), generator=one) == torch.rand((), generator=other))
+        False
+    """
+    seeds = torch.Generator("cpu").manual_seed(seed)
+    drawn = torch.randint(2**62, (get_args(Stream).index(name) + 1,), generator=seeds, device="cpu")
+    return torch.Generator(device).manual_seed(int(drawn[-1]))
 
 
 def restore_generator(generator: torch.Generator, state: Tensor) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_coadaptation import STEPS
+from test_coadaptation import STEPS, dealt
 from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import DoubleToFloat, TransformedEnv
@@ -16,21 +16,24 @@ from torchrl.envs import DoubleToFloat, TransformedEnv
 from coim import (
     Buffers,
     CoAdaptation,
+    DesignChoice,
     DynamicsLearner,
     EpisodeDone,
     GaussianEnsemble,
     GradientSearch,
     HopperMorph,
+    ImaginedReplay,
     KnownDesigns,
     ParticleSwarm,
     SACLearner,
     SimulatorDynamics,
+    UpdatePlan,
     WalkerMorph,
     WorldModelEnv,
     make_policy,
     make_qvalue,
 )
-from coim.agreement import check_dream, check_learners
+from coim.agreement import check_learners
 
 ENV = HopperMorph(num_runs=2, episode_steps=STEPS, seed=0)
 WALKER = WalkerMorph(num_runs=2, seed=0)
@@ -67,14 +70,16 @@ def algorithm(**parts: Any) -> CoAdaptation:
         "evaluation_env": HopperMorph(num_runs=2, episode_steps=STEPS, seed=1),
         "population": learner(),
         "individual": learner(),
-        "buffers": buffers(),
-        "search": GradientSearch(ENV.design_spec, num_starts=2, num_steps=2, seed=0),
-        "first_designs": torch.ones(1, 4),
-        "individual_updates": 2,
-        "population_updates": 2,
-        "model_updates": 2,
+        "buffers": parts.get("buffers", buffers()),
     }
-    return CoAdaptation(ENV, **given | parts)
+    choosing, learning, imagining, rest = dealt(parts, DesignChoice, UpdatePlan, ImaginedReplay, CoAdaptation)
+    search = GradientSearch(ENV.design_spec, num_starts=2, num_steps=2, seed=0)
+    chosen: dict[str, Any] = {"spec": ENV.design_spec, "first_designs": torch.ones(1, 4), "search": search}
+    updates = {"individual_updates": 2, "population_updates": 2, "model_updates": 2}
+    if imagining:
+        given["imagined"] = ImaginedReplay(**{"art": given["buffers"].art} | imagining)
+    given |= {"design_choice": DesignChoice(**chosen | choosing), "updates": UpdatePlan(**updates | learning)}
+    return CoAdaptation(ENV, **given | rest)
 
 
 def beyond(design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
@@ -205,7 +210,11 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
         lambda: dreaming(generator=lambda design, rng=None: design.double()),
         "makes designs in torch.float64 on cpu, of designs in torch.float32",
     ),
-    "no dream": (lambda: {"generator": KnownDesigns()}, "needs both a dream and a generator"),
+    "imagining into another buffer": (lambda: dreaming(art=buffers().art), "into another buffer than buffers.art"),
+    "a choice for other bodies": (
+        lambda: {"spec": WALKER.design_spec, "first_designs": torch.ones(1, 7), "search": None, "bodies": "random"},
+        r"design_choice chooses among designs of \[.*\] on cpu, the bodies have .*; make it with env\.design_spec",
+    ),
     "a dream that nobody trains": (
         lambda: dreaming(dynamics=DynamicsLearner(ensemble(), num_runs=2)),
         r"another ensemble than the one that dynamics trains; make it with dynamics\.ensemble",
@@ -291,7 +300,8 @@ def test_trying_g_moves_no_generator_that_others_draw_from() -> None:
 
     parts = dreaming()
     before = torch.random.get_rng_state()
-    check_dream(ENV, parts["dynamics"], parts["dream"], heedless, torch.ones(1, 4))
+    art = buffers().art
+    ImaginedReplay(art, parts["dream"], heedless).check_fits(ENV, art, parts["dynamics"], torch.ones(1, 4))
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
@@ -324,13 +334,14 @@ def test_a_fleet_of_one_run_searches_for_its_body() -> None:
         population=learner(1),
         individual=learner(1),
         buffers=buffers,
-        search=GradientSearch(env.design_spec, num_starts=2, num_steps=2, seed=0),
-        first_designs=torch.ones(1, 4),
+        design_choice=DesignChoice(
+            env.design_spec,
+            torch.ones(1, 4),
+            search=GradientSearch(env.design_spec, num_starts=2, num_steps=2, seed=0),
+        ),
         num_designs=2,
         first_episodes=1,
         episodes=1,
-        individual_updates=1,
-        population_updates=1,
-        batch_size=4,
+        updates=UpdatePlan(individual_updates=1, population_updates=1, batch_size=4),
     )
     assert [event.kind for event in made if isinstance(event, EpisodeDone)] == ["first", "optimised"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -10,16 +12,20 @@ import torch
 from coim import (
     Buffers,
     CoAdaptation,
+    DesignChoice,
     DesignChosen,
     DesignDone,
     DynamicsLearner,
     EpisodeDone,
     GaussianEnsemble,
+    Governor,
     HopperMorph,
+    ImaginedReplay,
     KnownDesigns,
     NoisyDesigns,
     ParticleSwarm,
     SACLearner,
+    UpdatePlan,
     WorldModelEnv,
     make_policy,
     make_qvalue,
@@ -29,10 +35,18 @@ from coim.batches import BatchParts
 STEPS = 12
 
 
+def dealt(settings: Mapping[str, Any], *makers: Callable[..., Any]) -> list[dict[str, Any]]:
+    """Deal out keywords to those that take them, one that several take to each of them."""
+    hands = [{k: v for k, v in settings.items() if k in inspect.signature(make).parameters} for make in makers]
+    assert {*settings} == {key for hand in hands for key in hand}
+    return hands
+
+
 def small(
     num_runs: int = 1,
     *,
     imagine: bool = True,
+    governed: bool = False,
     sigma: float | None = None,
     device: str = "cpu",
     replay: str | None = None,
@@ -51,34 +65,35 @@ def small(
         return SACLearner(policy, qvalue, num_runs=stacked, seed=seed)
 
     population, individual = learner(1), learner(2)  # before the ensemble: the same weights with and without one
+    choosing, learning, imagining, rest = dealt(settings, DesignChoice, UpdatePlan, ImaginedReplay, CoAdaptation)
+    capacities = {"pop_capacity": 200, "ind_capacity": 50, "s0_capacity": 20, "art_capacity": 50}
+    buffers = Buffers.for_env(env, **capacities, seed=0, device=replay or device)
     imagination: dict[str, Any] = {}
     if imagine:
         ensemble = GaussianEnsemble.for_env(env, num_cells=(8,), num_runs=stacked).to(device)
-        imagination = {
-            "dynamics": DynamicsLearner(ensemble, num_runs=stacked),
+        dream: dict[str, Any] = {
             "dream": WorldModelEnv(ensemble, env, batch_size=env.batch_size),
             "generator": KnownDesigns() if sigma is None else NoisyDesigns(env.design_spec, sigma=sigma),
+            "governor": Governor(ensemble) if governed else None,
         }
-    defaults: dict[str, Any] = {
+        imagination["dynamics"] = DynamicsLearner(ensemble, num_runs=stacked)
+        imagination["imagined"] = ImaginedReplay(buffers.art, **dream | imagining)
+    chosen: dict[str, Any] = {
+        "search": ParticleSwarm(env.design_spec, num_particles=5, num_iterations=2, seed=0),
         "first_designs": torch.tensor(HopperMorph.FIRST_DESIGNS[:2], device=device),
-        "num_designs": 5,
-        "first_episodes": 2,
-        "episodes": 1,
-        "individual_updates": 3,
-        "population_updates": 2,
-        "model_updates": 2,
-        "batch_size": 10,
         "num_start_states": 4,
     }
-    capacities = {"pop_capacity": 200, "ind_capacity": 50, "s0_capacity": 20, "art_capacity": 50}
+    learnt = {"individual_updates": 3, "population_updates": 2, "model_updates": 2, "batch_size": 10}
+    counts: dict[str, Any] = {"num_designs": 5, "first_episodes": 2, "episodes": 1}
     return CoAdaptation(
         env,
         evaluation_env,
         population=population,
         individual=individual,
-        buffers=Buffers.for_env(env, **capacities, seed=0, device=replay or device),
-        search=ParticleSwarm(env.design_spec, num_particles=5, num_iterations=2, seed=0),
-        **imagination | defaults | settings,
+        buffers=buffers,
+        design_choice=rest.pop("design_choice", None) or DesignChoice(env.design_spec, **chosen | choosing),
+        updates=UpdatePlan(**learnt | learning),
+        **imagination | counts | rest,
     )
 
 
@@ -115,7 +130,7 @@ def test_first_designs_are_those_given_and_later_ones_lie_in_the_bounds() -> Non
 
 def test_random_bodies_are_never_searched_for() -> None:
     algorithm = small(bodies="random")
-    algorithm.search.maximise = None  # type: ignore[assignment]
+    algorithm.design_choice.search.maximise = None  # type: ignore[union-attr, assignment]
     chosen = [event for event in algorithm if isinstance(event, DesignChosen)]
     assert [event.kind for event in chosen] == ["first", "first", "random", "random", "random"]
     assert len({tuple(event.design[0].tolist()) for event in chosen}) == 5
@@ -169,7 +184,7 @@ def test_without_imagination_nothing_is_imagined_and_no_model_is_trained() -> No
     episodes = [event for event in algorithm if isinstance(event, EpisodeDone)]
     assert all(event.imagined == 0 for event in episodes)
     assert not any("model" in key for event in episodes for key in event.metrics)
-    assert algorithm.population_parts == BatchParts(own=10, other=0, imagined=0)
+    assert algorithm.training.plan.rows("population") == BatchParts(own=10, other=0, imagined=0)
 
 
 def test_noisy_designs_are_imagined_but_never_stored_as_real() -> None:
@@ -261,7 +276,6 @@ def test_a_caller_can_stop_at_any_event() -> None:
         ({"first_designs": torch.ones(2, 3)}, r"first_designs has shape \[2, 3\], expected \[I, 4\]"),
         ({"first_designs": torch.full((1, 4), 3.0)}, "leaves"),
         ({"bodies": "serach"}, "bodies='serach' is unknown; choose 'search', 'random' or 'fixed'"),
-        ({"dream": None}, "both a dream and a generator"),
     ],
 )
 def test_bad_settings_get_a_sentence_before_anything_is_computed(settings: dict[str, Any], sentence: str) -> None:

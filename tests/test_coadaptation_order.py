@@ -10,8 +10,17 @@ import torch
 from tensordict import TensorDict
 from test_coadaptation import STEPS, small
 
-from coim import CoAdaptation, DesignChosen, DesignDone, DesignValue, EpisodeDone, coadaptation, imagined_replay
-from coim import design_choice as design_loop
+from coim import (
+    CoAdaptation,
+    DesignChosen,
+    DesignDone,
+    DesignValue,
+    EpisodeDone,
+    coadaptation,
+    design_choice,
+    imagined_replay,
+    updates,
+)
 from coim.batches import batch_parts
 
 
@@ -39,7 +48,7 @@ def traced(algorithm: CoAdaptation, monkeypatch: pytest.MonkeyPatch) -> list[str
         return f"{num_batches} batches of {parts}" + (", art marked" if imagined is algorithm.buffers.art else "")
 
     spy(coadaptation, "run_episode", episode)
-    spy(coadaptation, "sample_mixture", mixture)
+    spy(updates, "sample_mixture", mixture)
     spy(
         imagined_replay,
         "imagine",
@@ -141,7 +150,7 @@ def test_each_run_chooses_its_body_by_the_population_and_its_own_start_states(
             last = learner.qvalue.module.mlp.layers[-1]
             last.weight.zero_()
             last.bias.copy_((sign * worth).view(*last.bias.shape[:-2], 1, 1).expand_as(last.bias))
-    monkeypatch.setattr(design_loop, "DesignValue", Recorded)
+    monkeypatch.setattr(design_choice, "DesignValue", Recorded)
     chosen = next(events)
     assert isinstance(chosen, DesignChosen)
     assert chosen.kind == "optimised"
@@ -166,7 +175,7 @@ def test_the_best_return_is_that_of_the_best_evaluation_and_training_returns_do_
 
 def test_metrics_are_means_over_all_updates(monkeypatch: pytest.MonkeyPatch) -> None:
     algorithm = small(first_episodes=1, num_designs=1)
-    monkeypatch.setattr(coadaptation, "UPDATES_PER_SAMPLE", 2)
+    monkeypatch.setattr(updates, "UPDATES_PER_SAMPLE", 2)
     answers = {2: 1.0, 1: 4.0}  # three updates in two calls
     monkeypatch.setattr(
         algorithm.individual,
@@ -195,7 +204,7 @@ def test_a_batch_smaller_than_its_parts_is_refused(shares: dict[str, float]) -> 
 
 def test_no_draw_repeats_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
     algorithm = small(num_designs=6, individual_updates=2)
-    monkeypatch.setattr(coadaptation, "UPDATES_PER_SAMPLE", 1)
+    monkeypatch.setattr(updates, "UPDATES_PER_SAMPLE", 1)
     update, batches = algorithm.individual.update, []
     monkeypatch.setattr(
         algorithm.individual, "update", lambda rows: (batches.append(rows["observation"]), update(rows))[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -20,6 +21,10 @@ def equal(one: Any, other: Any, path: str = "state") -> None:
         assert one.keys() == other.keys(), path
         for key in one:
             equal(one[key], other[key], f"{path}.{key}")
+    elif isinstance(one, list):
+        assert len(one) == len(other), path
+        for index, (own, its) in enumerate(zip(one, other)):
+            equal(own, its, f"{path}[{index}]")
     elif isinstance(one, torch.Tensor):
         assert torch.equal(one, other), path
     else:
@@ -111,6 +116,22 @@ def test_more_designs_may_follow() -> None:
         equal(told(event), told(other))
 
 
+@pytest.mark.parametrize("settings", [{}, {"imagine": False}], ids=["paper", "baseline"])
+def test_a_state_of_before_the_choice_of_bodies_had_its_own_goes_on(settings: dict[str, Any]) -> None:
+    whole = small(**settings)
+    expected = list(whole)
+    for stop in (0, 9, len(expected) - 2):
+        first, second = small(**settings), small(**settings)
+        list(islice(first, stop))
+        state = saved(first)
+        choice = state.pop("design_choice")
+        state["search"], state["rngs"]["designs"] = choice["search"], choice["rng"]
+        del state["position"]["tried"]
+        second.load_state_dict(state)
+        for event, other in zip(second, expected[stop:], strict=True):
+            equal(told(event), told(other))
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
@@ -124,8 +145,8 @@ def test_another_algorithm_is_refused(settings: dict[str, Any], sentence: str) -
 
 
 def test_an_interrupt_does_not_wait_for_the_other_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    algorithm = small(side_by_side=True)
-    algorithm.population_updates = 10**9  # years
+    algorithm = small(imagine=False, side_by_side=True)
+    algorithm.training.plan = replace(algorithm.training.plan, population_updates=10**9)  # years
 
     def interrupted(batches: Any) -> Any:
         raise KeyboardInterrupt
@@ -133,4 +154,4 @@ def test_an_interrupt_does_not_wait_for_the_other_thread(monkeypatch: pytest.Mon
     monkeypatch.setattr(algorithm.individual, "update", interrupted)
     with pytest.raises(KeyboardInterrupt):
         list(algorithm)
-    algorithm._beside.shutdown(wait=True)  # type: ignore[union-attr]
+    algorithm.training._beside.shutdown(wait=True)  # type: ignore[union-attr]

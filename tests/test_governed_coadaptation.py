@@ -53,7 +53,7 @@ def same(one: Any, other: Any, run: slice = slice(None)) -> bool:
     return bool(one == other)
 
 
-GOVERNED: dict[str, Any] = {"governed": True, "imagined_states": "matched", "anchored": True, "sigma": 0.1}
+GOVERNED: dict[str, Any] = {"governed": True, "states_are": "matched", "anchored": True, "sigma": 0.1}
 
 
 def spoilt(algorithm: CoAdaptation, how: str) -> Iterator[Event]:
@@ -126,14 +126,14 @@ def test_batches_have_the_imagined_rows_that_each_run_has_earned(monkeypatch: py
         assert imagined.sum(1).squeeze(-1).tolist() == [[8, 0, 5]] * 2
 
 
-@pytest.mark.parametrize("settings", [{}, {"imagined_states": "matched"}, {"anchored": True}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"states_are": "matched"}, {"anchored": True}], ids=str)
 def test_the_share_of_impossible_pairs_is_counted_whatever_is_imagined(settings: dict[str, Any]) -> None:
     algorithm = small(3, sigma=0.5, batch_size=50, **settings)
     metrics = [event.metrics for event in algorithm if isinstance(event, EpisodeDone)]
     shares = torch.stack([found["impossible"] for found in metrics])
     assert shares.shape == (7, 3)
     assert ((shares >= 0) & (shares <= 1)).all()
-    assert bool(shares.any()) is (settings.get("imagined_states") != "matched")
+    assert bool(shares.any()) is (settings.get("states_are") != "matched")
 
 
 def test_a_governed_run_that_is_interrupted_goes_on_as_it_would_have(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,11 +192,11 @@ def test_eq_5_is_asked_about_matched_states_of_the_bodies_if_these_are_wanted(mo
 
 
 def test_what_is_unknown_or_cannot_be_governed_is_named() -> None:
-    for option in ("imagined_states", "imagined_actions", "value_states", "value_over"):
+    for option in ("states_are", "actions", "value_states", "value_over"):
         with pytest.raises(ValueError, match=f"{option}='new' is unknown; choose "):
             small(**{option: "new"})
-    with pytest.raises(ValueError, match="governed by the errors of the model that is learnt; give dynamics and dream"):
-        small(imagine=False, governed=True)
+    with pytest.raises(ValueError, match="governed by the errors of the model that is learnt; give dynamics"):
+        small(governed=True, dynamics=None)
 
 
 def test_bodies_that_do_not_know_how_high_they_stand_are_not_counted_and_not_matched(
@@ -209,7 +209,7 @@ def test_bodies_that_do_not_know_how_high_they_stand_are_not_counted_and_not_mat
     episodes = [event for event in small(sigma=0.1) if isinstance(event, EpisodeDone)]
     assert len(episodes) == 7
     assert not any("impossible" in event.metrics for event in episodes)
-    for option in ("imagined_states", "value_states"):
+    for option in ("states_are", "value_states"):
         with pytest.raises(ValueError, match="no affine function of its design"):
             small(**{option: "matched"})
 

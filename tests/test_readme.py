@@ -29,8 +29,8 @@ TINY = Settings(
 )
 
 
-def test_there_are_eight_snippets() -> None:
-    assert len(SNIPPETS) == 8
+def test_there_are_nine_snippets() -> None:
+    assert len(SNIPPETS) == 9
 
 
 @pytest.mark.parametrize("snippet", SNIPPETS, ids=lambda text: text.splitlines()[-1][:40])

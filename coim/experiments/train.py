@@ -20,6 +20,7 @@ from coim.experiments.run.best_policies import BestPolicies
 from coim.experiments.run.build import build
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.command_line import parse
+from coim.experiments.run.followed import Followed
 from coim.experiments.run.forecast import Forecast, work_of
 from coim.experiments.run.interrupt import (
     Stopped,
@@ -144,19 +145,19 @@ def train(
     return folder
 
 
-def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings) -> None:
+def follow(algorithm: Followed, folder: Path, name: str, settings: Settings) -> None:
     """Iterate, from the start or from the last checkpoint: write, show and log each event, and save between them."""
     best = BestPolicies(folder, algorithm)
     checkpoints = Checkpoints(folder, algorithm, best)
     notes = checkpoints.load() if settings.resume is not None else None
-    trial = algorithm.trial
+    trial = algorithm.position.trial
     names = type(algorithm.env).design_names()
     results = Results(folder, name, settings, names, notes=notes)
     progress = Progress(
         num_designs=settings.num_designs,
         forecast=forecast_of(algorithm, settings),
         updates=algorithm.updates_per_episode,
-        imagined_share=algorithm.population_parts.imagined / settings.batch_size,
+        imagined_share=algorithm.training.plan.rows("population").imagined / settings.batch_size,
         best=None if trial is None else trial.best,
         quiet=settings.quiet,
     )
@@ -181,10 +182,10 @@ def follow(algorithm: CoAdaptation, folder: Path, name: str, settings: Settings)
         print(results.table())
 
 
-def forecast_of(algorithm: CoAdaptation, settings: Settings) -> Forecast:
+def forecast_of(algorithm: Followed, settings: Settings) -> Forecast:
     """How long the run will take from where it stands; beside preset paper also how long a first look takes."""
-    body, chosen = type(algorithm.env), algorithm.index + (algorithm.trial is not None)
-    left = work_of(body, settings, episodes=algorithm.env_steps // settings.episode_steps, designs=chosen)
+    body, chosen = type(algorithm.env), algorithm.position.index + (algorithm.position.trial is not None)
+    left = work_of(body, settings, episodes=algorithm.position.env_steps // settings.episode_steps, designs=chosen)
     quick = work_of(body, QUICK)
     shorter = settings.preset != "quick" and quick.episodes < left.episodes
     return Forecast(left, goes_on=settings.resume is not None, quick=quick if shorter else None)

@@ -133,7 +133,7 @@ def test_it_acts_with_the_weights_of_before_the_updates_that_it_did_not_survive(
 def test_the_search_draws_as_many_numbers_for_it() -> None:
     def searching() -> CoAdaptation:
         algorithm = small(3)
-        algorithm.search = GradientSearch(algorithm.env.design_spec, num_starts=3, num_steps=2, seed=0)
+        algorithm.design_choice.search = GradientSearch(algorithm.env.design_spec, num_starts=3, num_steps=2, seed=0)
         return algorithm
 
     expected = list(searching())

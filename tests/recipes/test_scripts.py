@@ -14,6 +14,7 @@ from torchrl.data import Bounded
 from coim import (
     Buffers,
     CoAdaptation,
+    DesignChoice,
     DesignChosen,
     DesignDone,
     DynamicsLearner,
@@ -21,9 +22,11 @@ from coim import (
     Event,
     GaussianEnsemble,
     HopperMorph,
+    ImaginedReplay,
     KnownDesigns,
     ParticleSwarm,
     SACLearner,
+    UpdatePlan,
     WorldModelEnv,
     make_policy,
     make_qvalue,
@@ -45,28 +48,32 @@ def algorithm(seed: int, *, imagined_share: float) -> CoAdaptation:
         SACLearner(make_policy(env, num_cells=(8, 8)), make_qvalue(env, num_cells=(8, 8)), seed=seed + offset)
         for offset in (0, 1)
     )
+    capacities = {"pop_capacity": 1000, "ind_capacity": 100, "s0_capacity": 100, "art_capacity": 100}
+    buffers = Buffers.for_env(env, **capacities, seed=seed)
     imagination: dict[str, Any] = {}
     if imagined_share:
         ensemble = GaussianEnsemble.for_env(env, num_cells=(9,))
+        dream = WorldModelEnv(ensemble, env, batch_size=[1])
         imagination = {
             "dynamics": DynamicsLearner(ensemble),
-            "dream": WorldModelEnv(ensemble, env, batch_size=[1]),
-            "generator": KnownDesigns(),
+            "imagined": ImaginedReplay(buffers.art, dream, KnownDesigns()),
         }
-    capacities = {"pop_capacity": 1000, "ind_capacity": 100, "s0_capacity": 100, "art_capacity": 100}
     return CoAdaptation(
         env,
         evaluation_env,
         population=population,
         individual=individual,
-        buffers=Buffers.for_env(env, **capacities, seed=seed),
-        search=ParticleSwarm(env.design_spec, **SWARM, seed=seed),
-        first_designs=torch.tensor(HopperMorph.FIRST_DESIGNS),
-        imagined_share=imagined_share,
+        buffers=buffers,
+        design_choice=DesignChoice(
+            env.design_spec,
+            torch.tensor(HopperMorph.FIRST_DESIGNS),
+            search=ParticleSwarm(env.design_spec, **SWARM, seed=seed),
+            seed=seed,
+        ),
+        updates=UpdatePlan(**UPDATES, imagined_share=imagined_share),
         seed=seed,
         **imagination,
         **COUNTS,
-        **UPDATES,
     )
 
 

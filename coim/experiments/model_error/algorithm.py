@@ -17,16 +17,20 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from coim.batches import sample_mixture
-from coim.coadaptation import UPDATES_PER_SAMPLE, CoAdaptation
+from coim.coadaptation import CoAdaptation
 from coim.designs import NoisyDesigns, RandomDesigns
+from coim.envs import MorphEnv
 from coim.events import DesignChosen, EpisodeDone, Event
 from coim.experiments.model_error.errors import change_variance, mean_squares, persistence_error, prediction_error
 from coim.experiments.model_error.test_rows import Probes, joined
 from coim.experiments.run.results import Table
+from coim.learners.divergence import Divergence
 from coim.learners.dynamics import DynamicsLearner
+from coim.learners.sac import SACLearner
+from coim.position import Position
 from coim.randomness import restore_generator
 from coim.tables import Layout
+from coim.updates import Training
 
 COLUMNS = ["run", "design", "episode", "env_steps", "probe", "predict", "mse", "normalised", "rows", "impossible"]
 FILE = "model_error.csv"
@@ -61,7 +65,7 @@ class ProbedCoAdaptation:
         seed: of what is drawn for the measurements.
 
     Note:
-        Everything that is not defined here is the algorithm's, so that whoever follows an algorithm can follow this.
+        It is `Followed` as the algorithm itself is.
     """
 
     def __init__(
@@ -85,8 +89,35 @@ class ProbedCoAdaptation:
         self._rng.set_state(algorithm.rngs["model"].get_state())
         self._table: Table | None = None
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.algorithm, name)
+    @property
+    def env(self) -> MorphEnv:
+        """The algorithm's bodies to train on."""
+        return self.algorithm.env
+
+    @property
+    def evaluation_env(self) -> MorphEnv:
+        """The algorithm's bodies to evaluate on."""
+        return self.algorithm.evaluation_env
+
+    @property
+    def individual(self) -> SACLearner:
+        """The algorithm's individual learner."""
+        return self.algorithm.individual
+
+    @property
+    def position(self) -> Position:
+        """How far the algorithm is."""
+        return self.algorithm.position
+
+    @property
+    def divergence(self) -> Divergence:
+        """Which runs of the algorithm have diverged."""
+        return self.algorithm.divergence
+
+    @property
+    def training(self) -> Training:
+        """The algorithm's own updates."""
+        return self.algorithm.training
 
     @property
     def learners(self) -> dict[str, DynamicsLearner]:
@@ -96,7 +127,7 @@ class ProbedCoAdaptation:
     @property
     def updates_per_episode(self) -> int:
         """The algorithm's, and those of the other model."""
-        return self.algorithm.updates_per_episode + self.algorithm.model_updates
+        return self.algorithm.updates_per_episode + self.training.plan.model_updates
 
     def __iter__(self) -> Iterator[Event]:
         if self._table is None:
@@ -107,8 +138,7 @@ class ProbedCoAdaptation:
                 self._write(event, "next", rows)
             elif isinstance(event, EpisodeDone):
                 self._learn()
-                first = event.index < len(self.algorithm.first_designs)
-                last = self.algorithm.first_episodes if first else self.algorithm.episodes
+                last = self.algorithm.episodes_of(event.index)
                 if (event.episode + 1) % self.every == 0 or event.episode + 1 == last:
                     self._measure(event)
             yield event
@@ -149,15 +179,13 @@ class ProbedCoAdaptation:
 
     def _seed(self) -> int:
         """A new one for each measurement, and nothing to remember."""
-        return int(np.random.SeedSequence([self.seed, self.algorithm.env_steps]).generate_state(1)[0] // 2)
+        return int(np.random.SeedSequence([self.seed, self.position.env_steps]).generate_state(1)[0] // 2)
 
     def _learn(self) -> None:
         """Let the other model learn what the algorithm's own has just learnt."""
-        algorithm, pop = self.algorithm, self.algorithm.buffers.pop
-        self.other.observe(pop[len(pop) - algorithm.env.episode_steps :])
-        for done in range(0, algorithm.model_updates, UPDATES_PER_SAMPLE):
-            count = min(UPDATES_PER_SAMPLE, algorithm.model_updates - done)
-            self.other.update(sample_mixture([(pop, algorithm.batch_size)], count, rng=self._rng))
+        pop = self.algorithm.buffers.pop
+        self.other.observe(pop[len(pop) - self.env.episode_steps :])
+        self.training.train("model", self.other, rng=self._rng)
 
     def _measure(self, event: EpisodeDone) -> None:
         """All that is measured after an episode."""
@@ -189,7 +217,7 @@ class ProbedCoAdaptation:
         errors = {predict: prediction_error(one.ensemble, rows) for predict, one in self.learners.items()}
         errors["nothing"] = persistence_error(self.other.ensemble, rows)
         episode = event.episode + 1 if isinstance(event, EpisodeDone) else 0
-        counts, at = valid.sum(0).tolist(), (event.index + 1, episode, self.algorithm.env_steps, probe)
+        counts, at = valid.sum(0).tolist(), (event.index + 1, episode, self.position.env_steps, probe)
         shares = [None] * len(counts) if impossible_share is None else impossible_share.tolist()
         self._table.append(
             [run, *at, predict, *square, count, share]

@@ -17,9 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coim.coadaptation import CoAdaptation
 from coim.events import DesignChosen, EpisodeDone, Event
 from coim.experiments.run.atomic_write import write_whole
+from coim.experiments.run.followed import Followed
 from coim.run_folder import policy_path
 
 
@@ -31,7 +31,7 @@ class BestPolicies:
         algorithm: whose events are followed; nothing in it is changed.
     """
 
-    def __init__(self, folder: Path, algorithm: CoAdaptation) -> None:
+    def __init__(self, folder: Path, algorithm: Followed) -> None:
         self.folder, self.algorithm = folder, algorithm
         self._best: dict[str, Any] = {}
         self._start = self._next_start()

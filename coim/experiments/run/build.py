@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
 
-from coim.batches import batch_parts
 from coim.buffers import Buffers
 from coim.coadaptation import CoAdaptation
+from coim.design_choice import DesignChoice
 from coim.designs import (
     DesignGenerator,
     DesignSearch,
@@ -23,9 +24,12 @@ from coim.designs import (
 from coim.envs import MorphEnv, SimulatorDynamics, WorldModelEnv
 from coim.experiments.run.machine import checked_device
 from coim.experiments.run.settings import Settings
+from coim.governor import Governor
+from coim.imagined_replay import ImaginedReplay
 from coim.learners.dynamics import DynamicsLearner
 from coim.learners.sac import SACLearner
 from coim.models import NetworkSizes
+from coim.updates import UpdatePlan
 
 SIMULATED_ROWS = 250  # bodies that the simulator sets up and steps at once where it takes the ensemble's place
 
@@ -53,43 +57,55 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
     env, evaluation_env = bodies(), bodies()
     sizes = NetworkSizes.among(vars(settings))
     population, individual = (make_learner(env, sizes, settings, seed=next(seeds)) for _ in range(2))
-    generator = make_generator(env, settings)
     dynamics, dream = None, None
+    generator = make_generator(env, settings)
     if generator is not None:
         dynamics, dream = make_dream(env, sizes, settings, threads=threads)
+    buffers = make_buffers(env, settings, seed=next(seeds))
+    search = make_search(env, settings, seed=next(seeds))
+    imagined = None
+    if generator is not None and dream is not None:
+        imagined = ImaginedReplay(
+            buffers.art,
+            dream,
+            generator,
+            states_are=settings.imagined_states,
+            anchored=settings.anchored,
+            actions=settings.imagined_actions,
+            governor=Governor(dynamics.ensemble) if settings.governed and dynamics is not None else None,
+        )
+    seed = next(seeds)
     return CoAdaptation(
         env,
         evaluation_env,
         population=population,
         individual=individual,
-        buffers=make_buffers(env, settings, seed=next(seeds)),
-        search=make_search(env, settings, seed=next(seeds)),
-        first_designs=torch.tensor(first_designs(body, settings), dtype=torch.float32, device=device),
-        bodies=settings.bodies,
+        buffers=buffers,
+        design_choice=DesignChoice(
+            env.design_spec,
+            torch.tensor(first_designs(body, settings), dtype=torch.float32, device=device),
+            search=search,
+            bodies=settings.bodies,
+            num_start_states=settings.num_start_states,
+            value_states=settings.value_states,
+            value_over=settings.value_over,
+            precision=settings.precision,
+            seed=seed,
+        ),
         dynamics=dynamics,
-        dream=dream,
-        generator=generator,
+        imagined=imagined,
         num_designs=settings.num_designs,
         first_episodes=settings.first_episodes,
         episodes=settings.episodes,
-        individual_updates=settings.individual_updates,
-        population_updates=settings.population_updates,
-        model_updates=settings.model_updates,
-        batch_size=settings.batch_size,
-        imagined_share=settings.imagined_share,
-        individual_mix=settings.individual_mix,
-        individual_imagined_share=settings.individual_imagined_share,
-        imagined_states=settings.imagined_states,
-        imagined_actions=settings.imagined_actions,
-        anchored=settings.anchored,
-        governed=settings.governed and generator is not None,
-        num_start_states=settings.num_start_states,
-        value_states=settings.value_states,
-        value_over=settings.value_over,
+        updates=update_plan(settings),
         side_by_side=side_by_side,
-        precision=settings.precision,
-        seed=next(seeds),
+        seed=seed,
     )
+
+
+def update_plan(settings: Settings) -> UpdatePlan:
+    """How much is learnt after each episode, from the settings of the same names."""
+    return UpdatePlan(**{field.name: getattr(settings, field.name) for field in fields(UpdatePlan)})
 
 
 def make_learner(env: MorphEnv, sizes: NetworkSizes, settings: Settings, *, seed: int) -> SACLearner:
@@ -165,17 +181,12 @@ def make_search(env: MorphEnv, settings: Settings, *, seed: int) -> DesignSearch
 def make_buffers(env: MorphEnv, settings: Settings, *, seed: int) -> Buffers:
     """Four buffers that can hold everything this run will ever put into them."""
     episodes = episodes_of_designs(type(env), settings)
-    population = batch_parts(settings.batch_size, imagined=settings.imagined_share)
-    individual = batch_parts(
-        settings.batch_size, imagined=settings.individual_imagined_share, other=settings.individual_mix
-    )
-    imagined = settings.population_updates * population.imagined + settings.individual_updates * individual.imagined
     return Buffers.for_env(
         env,
         pop_capacity=sum(episodes) * settings.episode_steps,
         ind_capacity=max(episodes) * settings.episode_steps,
         s0_capacity=sum(episodes),
-        art_capacity=max(1, imagined),
+        art_capacity=update_plan(settings).imagined_rows,
         seed=seed,
         device=checked_device("cpu" if settings.replay_device == "cpu" else settings.device),
     )

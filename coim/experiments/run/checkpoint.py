@@ -32,9 +32,9 @@ from coim.checkpoints import (
     read_notes,
     state_parts,
 )
-from coim.coadaptation import CoAdaptation
 from coim.experiments.run.atomic_write import ASIDE, sync, telling_full_disk
 from coim.experiments.run.best_policies import BestPolicies
+from coim.experiments.run.followed import Followed
 from coim.experiments.run.replay_file import ReplayFile
 
 KEPT = 2
@@ -53,7 +53,7 @@ class Checkpoints:
         read out of Replay_Pop again. Replay_Art is written.
     """
 
-    def __init__(self, folder: Path, algorithm: CoAdaptation, best: BestPolicies) -> None:
+    def __init__(self, folder: Path, algorithm: Followed, best: BestPolicies) -> None:
         self.folder, self.algorithm, self.best = folder / "checkpoint", algorithm, best
         self._replay = ReplayFile(self.folder / "replay.bin")
         self._step = 0

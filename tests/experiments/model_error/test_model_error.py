@@ -132,7 +132,7 @@ def test_each_probe_is_driven_by_the_policy_that_it_tells_of(tmp_path: Path, mon
 
         monkeypatch.setattr(measured.probes, name, noted)
     list(measured)
-    individual, population = measured.individual.policy, measured.population.policy
+    individual, population = measured.algorithm.individual.policy, measured.algorithm.population.policy
     seen, next_design, never_built = individual, population, population
     assert [driver is individual for driver in drivers] == [
         driver is individual for driver in (seen, never_built, next_design, seen, never_built)
