@@ -19,8 +19,8 @@ from coim.envs.morph import MorphEnv
 from coim.envs.simulator_dream import SimulatorDynamics
 from coim.envs.world_model import WorldModelEnv
 from coim.learners.dynamics import DynamicsLearner
+from coim.learners.known_networks import check_exchangeable
 from coim.learners.sac import SACLearner
-from coim.learners.written_out import check_exchangeable
 from coim.models.ensemble import GaussianEnsemble
 
 

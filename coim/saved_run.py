@@ -6,7 +6,6 @@ Shapes: T steps, K runs, D design.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from coim.checkpoints import files_complaint, newest_whole, read_notes, read_state
 from coim.envs import BODIES, MorphEnv
 from coim.episode import run_episode
-from coim.learners.flat_weights import check_sizes, views
+from coim.learners.flat_weights import read_networks
 from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, select_run
 from coim.run_folder import TriedDesign, policy_path, read_config, read_designs
 
@@ -166,13 +165,13 @@ def load_run(
 
     def agent(state: dict[str, Any]) -> Agent:
         policy, qvalue = sizes.policy(bodies), sizes.qvalue(bodies)
-        _fill([policy.network.mlp, qvalue.module.mlp], state["weights"])
+        read_networks({"policy": policy.network.mlp, "qvalue": qvalue.module.mlp}, state)
         return Agent(ready(policy), ready(qvalue))
 
     state, ensemble = _last_state(folder), None
     if state["dynamics"] is not None:
         ensemble = sizes.ensemble(bodies)
-        _fill([ensemble.network], state["dynamics"]["weights"])
+        read_networks({"ensemble": ensemble.network}, state["dynamics"])
         ensemble.inputs.load_state_dict(state["dynamics"]["inputs"])
         ensemble.targets.load_state_dict(state["dynamics"]["targets"])
     return SavedRun(
@@ -197,15 +196,6 @@ def _last_state(folder: Path) -> dict[str, Any]:
         warnings.warn(f"{worse} is damaged ({why}); reading {path.name}", stacklevel=3)
     read_notes(path)
     return read_state(path, "algorithm", device="cpu")
-
-
-@torch.no_grad()
-def _fill(networks: Iterable[nn.Module], flat: Tensor) -> None:
-    """Read networks out of a learner's flat buffer, in the order in which it laid them out."""
-    parameters = [parameter for network in networks for parameter in network.parameters()]
-    check_sizes({"weights": torch.cat([parameter.reshape(-1) for parameter in parameters])}, {"weights": flat})
-    for parameter, values in zip(parameters, views(flat, cast(Sequence[Tensor], parameters))):
-        parameter.copy_(values)
 
 
 def _row(state: dict[str, Any], run: int) -> dict[str, Any]:

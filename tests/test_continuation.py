@@ -136,7 +136,10 @@ def test_a_state_of_before_the_choice_of_bodies_had_its_own_goes_on(settings: di
     ("settings", "sentence"),
     [
         ({"imagine": False}, "has a dynamics and the other has none"),
-        ({"num_runs": 2}, r"weights, this learner has \d+; make it with the sizes"),
+        (
+            {"num_runs": 2},
+            r"policy.layers.0.weight is \(15, 8\) in the state and \(2, 15, 8\) in this learner; make it with",
+        ),
     ],
 )
 def test_another_algorithm_is_refused(settings: dict[str, Any], sentence: str) -> None:

@@ -11,18 +11,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 from test_coadaptation import small
-from toy_env import ToyEnv
+from toy_learners import dynamics_learner, sac_learner
 
 from coim import (
     CoAdaptation,
     DesignChosen,
     DynamicsLearner,
     EpisodeDone,
-    GaussianEnsemble,
     HopperMorph,
     SACLearner,
     make_policy,
-    make_qvalue,
     run_episode,
 )
 
@@ -30,20 +28,14 @@ pytestmark = pytest.mark.gpu
 Rows = Callable[..., TensorDict]
 
 
-def sac_learner() -> SACLearner:
+def sac() -> SACLearner:
     """On the GPU, the same each time."""
-    torch.manual_seed(0)
-    policy, qvalue = (
-        make(ToyEnv(), num_cells=(16, 16), num_runs=3).double().cuda() for make in (make_policy, make_qvalue)
-    )
-    return SACLearner(policy, qvalue, num_runs=3, seed=1)
+    return sac_learner(3, device="cuda")
 
 
-def dynamics_learner() -> DynamicsLearner:
+def dynamics() -> DynamicsLearner:
     """On the GPU, the same each time."""
-    torch.manual_seed(0)
-    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_cells=(16, 16), num_runs=3)
-    return DynamicsLearner(ensemble.double().cuda(), num_runs=3)
+    return dynamics_learner(3, device="cuda")
 
 
 def saved(algorithm: CoAdaptation) -> Mapping[str, Any]:
@@ -54,14 +46,14 @@ def saved(algorithm: CoAdaptation) -> Mapping[str, Any]:
     return torch.load(file, map_location="cpu", weights_only=True)
 
 
-@pytest.mark.parametrize("make", [sac_learner, dynamics_learner])
+@pytest.mark.parametrize("make", [sac, dynamics])
 def test_an_update_by_a_captured_graph_is_the_eager_one(
     make: Callable[[], Any], make_rows: Rows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batches = make_rows(20, 32, 3).cuda()
     captured = make()
     with monkeypatch.context() as patched:
-        patched.setattr("coim.learners.flat_weights.captures", lambda device: False)
+        patched.setattr("coim.learners.captured.captures", lambda device: False)
         eager = make()
         eager.update(batches)
     captured.update(batches)

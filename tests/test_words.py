@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCES = [
     path
-    for folder in ("coim/designs", "coim/envs", "coim/models", "coim/objectives", "recipes")
+    for folder in ("coim/designs", "coim/envs", "coim/learners", "coim/models", "coim/objectives", "recipes")
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 RIDDLES = re.compile(r"(Of|Whose|Who|What it is that)\b")

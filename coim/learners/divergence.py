@@ -1,9 +1,9 @@
-"""Runs whose learning has diverged: found, frozen, and kept away from all that comes after.
+"""Find runs whose learning has diverged, and freeze them.
 
-A run of K has diverged when one of its losses, weights or moments is no finite number any more. Its weights are put
-back to what they were before that episode's updates, and after every later episode's too: it acts on, on the body that
-it has, but learns nothing. So nothing that is not finite ever reaches a body, a replay, a dream or a search, every
-random number is drawn as it would have been, and the other runs go on to the last bit as if it had not diverged.
+A run of K has diverged when one of its losses, weights or moments is not finite any more. Its weights are put back to
+what they were before the updates of that episode, and after each later episode again: the run keeps its body and acts,
+but learns nothing. So only finite numbers reach a body, a replay, a dream or a search. Every random number is drawn as
+it would have been, and the other runs go on, to the last bit, as if this one had not diverged.
 
 Shapes: K runs.
 """
@@ -11,40 +11,40 @@ Shapes: K runs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from coim.events import Place
+from coim.learners.flat_weights import FlatLearner
 
 # Far beyond any weight that has learnt something, and small enough that the outputs of finite weights are finite: four
 # layers of 500 units multiply an input by less than (500 * 1e5)^4 = 6e30, and float32 ends at 3e38.
 LARGEST_WEIGHT = 1e5
 
 
-class Learner(Protocol):
-    """What learning writes to, each tensor ``[K, ...]`` and a view of the learner's own."""
-
-    def weights_by_run(self) -> list[Tensor]:
-        """Weights, and targets if there are any."""
-
-    def moments_by_run(self) -> list[Tensor]:
-        """Of the optimiser; none before its first step."""
-
-
 class Divergence:
-    """Which runs have diverged and where, and what is done about it around each episode's updates.
+    """The runs that have diverged, and the weights that they are put back to.
 
     Args:
         num_runs: K.
-        learners: all that learn.
+        learners: all learners of the algorithm.
 
     Attributes:
-        places: the design and the episode of whose updates each diverged run did not survive, both from 0.
+        places: design and episode, both from 0, after which each diverged run was found.
+
+    Example:
+        >>> from coim import DynamicsLearner, GaussianEnsemble, HopperMorph
+        >>> env = HopperMorph(num_runs=2, seed=0)
+        >>> learner = DynamicsLearner(GaussianEnsemble.for_env(env, num_cells=(8,), num_runs=2), num_runs=2)
+        >>> divergence = Divergence(2, [learner])
+        >>> divergence.remember()
+        >>> divergence.contain({"loss_dynamics": torch.tensor([0.5, torch.inf])}, (3, 0))
+        >>> divergence.places
+        {1: (3, 0)}
     """
 
-    def __init__(self, num_runs: int, learners: Sequence[Learner]) -> None:
+    def __init__(self, num_runs: int, learners: Sequence[FlatLearner]) -> None:
         self.num_runs, self.learners = num_runs, learners
         self.places: dict[int, Place] = {}
         self._good: list[Tensor] = []
@@ -58,11 +58,11 @@ class Divergence:
             self._good = [tensor.clone() for tensor in weights]
 
     def contain(self, metrics: Mapping[str, Tensor], place: Place) -> None:
-        """Find the runs that have diverged in these updates, and put back what was remembered of all that ever have.
+        """Find the runs that diverged in these updates, and put back the weights of all that have diverged so far.
 
         Args:
-            metrics: of these updates, ``[K]`` each.
-            place: where that was.
+            metrics: what the updates returned, ``[K]`` each.
+            place: design and episode of these updates.
         """
         sound = self._sound(metrics)
         for run in (~sound).nonzero().flatten().tolist():
@@ -75,11 +75,11 @@ class Divergence:
                     moment[run] = 0.0
 
     def frozen_before(self, place: Place) -> list[int]:
-        """Runs that had diverged before an episode of a design; with episode 0, before the design began."""
+        """List the runs that had diverged before an episode of a design; with episode 0, before the design began."""
         return [run for run, diverged in self.places.items() if diverged < place]
 
     def blank(self, values: Tensor, place: Place) -> Tensor:
-        """The numbers of all runs, ``[K, ...]``, NaN where a run had diverged before."""
+        """Return the numbers of all runs, ``[K, ...]``, with NaN where a run had diverged before."""
         frozen = self.frozen_before(place)
         if not frozen:
             return values
@@ -89,14 +89,14 @@ class Divergence:
 
     @property
     def everywhere(self) -> bool:
-        """Whether no run is left that learns."""
+        """Whether all runs have diverged."""
         return len(self.places) == self.num_runs
 
     def _weights(self) -> list[Tensor]:
         return [tensor.detach() for learner in self.learners for tensor in learner.weights_by_run()]
 
     def _sound(self, metrics: Mapping[str, Tensor]) -> Tensor:
-        """Which runs hold finite numbers alone, ``[K]`` bool on the CPU."""
+        """Tell for each run whether its numbers are finite and its weights small enough, ``[K]`` bool on the CPU."""
         sound = torch.ones(self.num_runs, dtype=torch.bool, device="cpu")
         for value in metrics.values():
             sound &= value.isfinite().cpu()
@@ -108,7 +108,7 @@ class Divergence:
 
 
 def _largest(rows: Tensor) -> Tensor:
-    """Largest absolute value of each row, NaN if there is one; twenty times faster than its norm, ``[K, N] -> [K]``."""
+    """Largest absolute value of each row, ``[K, N] -> [K]``, NaN if the row has one; 20 times faster than its norm."""
     return torch.maximum(rows.amax(1), -rows.amin(1))
 
 

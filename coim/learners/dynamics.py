@@ -1,9 +1,9 @@
 """The dynamics learner of Algorithm 1: ensemble, loss and optimiser as one thing.
 
-`coim.objectives.EnsembleNLLLoss` says what is learnt; `coim.objectives.dynamics_gradients` computes its gradients
-faster. All weights lie in one flat buffer, of which the ensemble's parameters are views.
+`coim.objectives.EnsembleNLLLoss` says what is learnt. `coim.objectives.dynamics_gradients` computes its gradients
+faster and is what trains; ``tests/objectives/test_dynamics_gradients.py`` holds the two equal.
 
-Shapes: U updates, B batch, K runs, E members, F input features, S state, R rows.
+Shapes: U updates, B batch, K runs, F input features, S state.
 
 References:
     "Co-Imagination of Behaviour & Morphology of Agents" (CoIm), Eq. 6, Algorithm 1 and Sec. 6.1.
@@ -16,21 +16,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from coim.compiling import compiled
-from coim.learners.flat_weights import (
-    FlatUpdates,
-    Precision,
-    by_run,
-    check_sizes,
-    load_moments,
-    moments_by_run,
-    on_device,
-    share_storage,
-    views,
-)
-from coim.learners.written_out import check_ensemble
+from coim.learners.flat_weights import FlatLearner, Precision
+from coim.learners.known_networks import check_ensemble
+from coim.learners.rows import on_device, runs_first
 from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
 from coim.objectives.dynamics import EnsembleNLLLoss, check_one_step
 from coim.objectives.dynamics_gradients import dynamics_gradients
@@ -38,21 +29,21 @@ from coim.objectives.gradients import Network
 from coim.objectives.runs import by_update, check_batch, check_runs_last
 
 
-class DynamicsLearner:
-    """The Gaussian ensemble learning Eq. 6 with Adam and weight decay (Sec. 6.1).
+class DynamicsLearner(FlatLearner):
+    """The Gaussian ensemble, which learns Eq. 6 with Adam and weight decay (Sec. 6.1).
 
     Args:
         ensemble: the model, on its device and in its dtype already; its normalisers are fed by `observe`.
         lr: learning rate.
         weight_decay: L2 penalty of Adam, as in the ensembles of PETS that the paper follows.
         num_runs: K when the ensemble is stacked along the run axis.
-        precision: ``"bfloat16"`` takes the network's products in bfloat16; weights, moments, targets and losses stay as
-            they are.
+        precision: ``"bfloat16"`` computes the network's products in bfloat16; weights, moments, targets and losses
+            stay as they are.
         compile: compile the gradients by `torch.compile` in the first update; results differ by rounding.
 
     Attributes:
         loss: the `EnsembleNLLLoss` over the same parameters, for those who want its value or its gradients.
-        optimiser: Adam over the flat buffer of all weights.  Its settings may be changed at any time; the next update
+        optimiser: Adam over the flat buffer of all weights. Its settings may be changed at any time; the next update
             follows.
 
     Raises:
@@ -60,8 +51,8 @@ class DynamicsLearner:
         TypeError: if the ensemble computes anything else than a `coim.GaussianEnsemble`.
 
     Note:
-        Moving the ensemble to another device or dtype afterwards parts it from the flat buffer; so does a deep copy of
-        the learner.
+        Moving the ensemble to another device or dtype afterwards parts it from the flat buffer, and so does a deep copy
+        of the learner; `update` refuses that.
 
     Example:
         >>> from coim import HopperMorph
@@ -83,18 +74,16 @@ class DynamicsLearner:
         precision: Precision = "float32",
         compile: bool = False,
     ) -> None:
-        if precision not in ("float32", "bfloat16"):
-            raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
         check_ensemble(ensemble)
-        self.ensemble, self.num_runs = ensemble, num_runs
+        self.ensemble = ensemble
         self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
-        self._lay_out(list(ensemble.network.parameters()), precision)
+        networks = {"ensemble": ensemble.network}
+        super().__init__(networks, lr=lr, weight_decay=weight_decay, num_runs=num_runs, precision=precision)
+        self._cut_networks()
         self._find = compiled(dynamics_gradients, self._weights.device) if compile else dynamics_gradients
-        self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
-        self.optimiser = self._updates.optimiser
 
     def observe(self, rows: TensorDictBase) -> None:
-        """Count new rows of Replay_Pop in the running means and deviations that scale inputs and targets.
+        """Add new rows of Replay_Pop to the running means and deviations that scale inputs and targets.
 
         Args:
             rows: ``[*B, (K)]`` on any device, each row once in its life.
@@ -107,47 +96,18 @@ class DynamicsLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what learning has changed: weights, moments, statistics. Tensors are not copied."""
-        return {
-            "weights": self._weights.detach(),
-            "moments": dict(self.optimiser.state.get(self._weights, {})),
-            "inputs": dict(self.ensemble.inputs.state_dict()),
-            "targets": dict(self.ensemble.targets.state_dict()),
-        }
+        statistics = {"inputs": self.ensemble.inputs.state_dict(), "targets": self.ensemble.targets.state_dict()}
+        return super().state_dict() | {name: dict(state) for name, state in statistics.items()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on as the learner that :meth:`state_dict` was read from.
-
-        Raises:
-            ValueError: if that one's ensemble has other sizes; nothing is changed then.
-        """
-        weights = self._weights.detach()
-        check_sizes({"weights": weights}, state_dict)
-        weights.copy_(state_dict["weights"])
-        load_moments(self.optimiser, self._weights, state_dict["moments"])
+        """Go on as the learner that :meth:`state_dict` was read from; see `FlatLearner.load_state_dict`."""
+        super().load_state_dict(state_dict)
         self.ensemble.inputs.load_state_dict(state_dict["inputs"])
         self.ensemble.targets.load_state_dict(state_dict["targets"])
 
-    def weights_by_run(self) -> list[Tensor]:
-        """Weights with the run axis first, ``[K, ...]``: views, not copies."""
-        return by_run(self._weights, [*self.ensemble.network.parameters()], self.num_runs)
-
-    def moments_by_run(self) -> list[Tensor]:
-        """Adam's moments, as `weights_by_run` has the weights; none before its first step."""
-        parameters = [*self.ensemble.network.parameters()]
-        return moments_by_run(self.optimiser, self._weights, parameters, self.num_runs)
-
-    def check_networks_lie_here(self) -> None:
-        """Refuse to go on with an ensemble that was moved, or given to another learner, after this one was made.
-
-        Raises:
-            RuntimeError: if the ensemble's weights no longer lie in the flat buffer.
-        """
-        if next(self.ensemble.network.parameters()).data_ptr() != self._weights.data_ptr():
-            raise RuntimeError("the ensemble was moved after its learner was made; make the learner last")
-
     @torch.no_grad()
     def error(self, rows: TensorDictBase) -> Tensor:
-        """Squared error of the members' means, in units of the variance of one-step changes in these rows.
+        """Compute the squared error of the members' means, in variances of the one-step changes in these rows.
 
         Args:
             rows: ``[*B, (K)]`` on any device, at least two for each run.
@@ -167,7 +127,7 @@ class DynamicsLearner:
 
     @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:
-        """One optimiser step per batch.
+        """Do one optimiser step per batch.
 
         Args:
             batches: rows in the transition schema, on any device, shaped as for `coim.SACLearner.update`: ``[B, K]`` is
@@ -178,7 +138,7 @@ class DynamicsLearner:
 
         Raises:
             ValueError: if the rows have another shape, there are none, or a next observation is several steps ahead.
-            RuntimeError: if the ensemble's weights no longer lie in the flat buffer.
+            RuntimeError: if the ensemble was moved since the learner was made.
         """
         batches = by_update(batches, self.num_runs)
         self.check_networks_lie_here()
@@ -186,34 +146,27 @@ class DynamicsLearner:
         return TensorDict({"loss_dynamics": mean}, mean.shape)
 
     def _taken(self, rows: TensorDictBase) -> TensorDictBase:
-        """Rows on the device of the ensemble, after they were found to be what it learns from."""
+        """Check that the ensemble can learn from these rows, and move them to its device."""
         check_batch(rows.batch_size, self.num_runs)
         check_runs_last(rows, self.num_runs)
         check_one_step(rows, self.loss.tensor_keys.steps_to_next_obs)
         return on_device(rows, self._weights.device)
 
-    def _update_once(self, x: Tensor, target: Tensor) -> Tensor:
-        """One update with a batch, ``[K, B, F]`` and ``[K, B, S]``; its losses, ``[K]``."""
-        if self._read_weights.dtype != self._weights.dtype:
-            self._read_weights.copy_(self._weights)
-        losses = self._write_gradients(x, target)
+    def _update_once(self, *rows: Tensor) -> Tensor:
+        """Do one update with inputs ``[K, B, F]`` and targets ``[K, B, S]``; return the losses, ``[K]``."""
+        self._renew()
+        losses = self._write_gradients(*rows)
         self.optimiser.step()
         return losses
 
-    def _lay_out(self, parameters: list[nn.Parameter], precision: Precision) -> None:
-        """Move all weights into one flat buffer, and cut it and that of the gradients into networks."""
-        self._weights = nn.Parameter(share_storage(parameters))
-        self._weights.grad = torch.zeros_like(self._weights.detach())
-        # Products read these: the weights themselves, or a copy in bfloat16 that every update renews.
-        self._read_weights = self._weights.detach()
-        if precision == "bfloat16":
-            self._read_weights = self._read_weights.to(torch.bfloat16)
+    def _cut_networks(self) -> None:
+        """Cut the flat buffers into networks for the products and into the gradients that Adam reads."""
         stack = len(self.ensemble.network.stack)
         read, gradients = (
-            [part.flatten(0, stack - 1) for part in views(flat, parameters)]
-            for flat in (self._read_weights, self._weights.grad)
+            [part.flatten(0, stack - 1) for part in self._parts(flat)["ensemble"]]
+            for flat in (self._read_weights, self._gradient)
         )
-        # A CPU multiplies the matrices of one member after the other; a GPU wants all in one product.
+        # A CPU multiplies the matrices of one member after the other; a GPU takes all members in one product.
         self._stacked = self._weights.device.type != "cpu" or self._read_weights.dtype == torch.float64
         members = [slice(None)] if self._stacked else range(len(read[0]))
         self._networks = [Network([w[m] for w in read[0::2]], [b[m] for b in read[1::2]]) for m in members]
@@ -221,15 +174,14 @@ class DynamicsLearner:
 
     def _arrange(self, batches: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Standardised inputs ``[U, K, B, F]``, in the dtype of the products, and targets ``[U, K, B, S]``."""
-        observation, runs = batches["observation"], self.num_runs or 1
+        observation = batches["observation"]
         raw = torch.cat([observation, batches["action"], batches["design"]], -1)
         inputs = self.ensemble.inputs(raw).to(self._read_weights.dtype)
         targets = self.ensemble.standardised_target(observation, batches["next", "observation"])
-        found = (x.reshape(len(x), -1, runs, x.shape[-1]).transpose(1, 2).contiguous() for x in (inputs, targets))
-        return next(found), next(found)
+        return runs_first(inputs, self.num_runs), runs_first(targets, self.num_runs)
 
     def _write_gradients(self, x: Tensor, target: Tensor) -> Tensor:
-        """Write the gradients of ``[K, B, F]`` and ``[K, B, S]`` where Adam reads them; returns the losses, ``[K]``."""
+        """Write the gradients of ``[K, B, F]`` and ``[K, B, S]`` where Adam reads them; return the losses, ``[K]``."""
         members = self.ensemble.num_members
         if self._stacked:
             batches = [(x.repeat_interleave(members, 0), target.repeat_interleave(members, 0))]

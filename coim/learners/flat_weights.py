@@ -1,88 +1,165 @@
-"""Weights in one flat buffer, and the updates of an optimiser over it, which CUDA replays as one graph.
+"""Weights in one flat buffer: what the learners share.
 
-Shapes: K runs.
+Adam and a target update are one operation each over a flat buffer, and the networks' parameters are views of it:
+whoever holds a network holds the one that learns.
+
+Shapes: N weights, K runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 
+from coim.learners.captured import FlatUpdates
+
 Precision = Literal["float32", "bfloat16"]
+WAY_OUT = (
+    "make it with the hidden units, the number of critics or members and the number of runs that the state was saved "
+    "with"
+)
 
 
-class FlatUpdates:
-    """Updates by Adam over one flat buffer of weights; on CUDA one is captured as a graph and replayed.
+class FlatLearner:
+    """Networks whose weights lie in one flat buffer, with Adam over it and a state that can be saved.
 
-    A graph repeats what it saw. What may change between two calls is therefore read from tensors, as the learning rate
-    is, or has the next update captured anew.
+    A subclass writes `_update_once`, which computes one update and returns its losses, and calls
+    ``self._updates.mean`` to do many.
 
     Args:
-        update: computes gradients, writes them into ``weights.grad`` and calls ``optimiser.step()``.
-        weights: the flat buffer; its gradient is there already.
+        networks: by name, in the order in which their weights are laid out; on their device and in their dtype already.
         lr: learning rate.
-        weight_decay: L2 penalty.
+        weight_decay: L2 penalty of Adam.
+        num_runs: K when the networks are stacked along the run axis.
+        precision: ``"bfloat16"`` has the products read a copy of the weights in bfloat16; the weights stay as they are.
 
     Attributes:
-        optimiser: Adam. All of its settings can be changed at any time, by hand or by a scheduler.
+        num_runs: K, or None.
+        optimiser: Adam over the flat buffer. Its settings may be changed at any time; the next update follows.
+
+    Raises:
+        ValueError: if ``precision`` is unknown.
+
+    Note:
+        Moving a network to another device or dtype afterwards, or giving it to another learner, parts it from the flat
+        buffer; so does a deep copy of the learner. An update refuses that.
+
+    Example:
+        >>> from coim import DynamicsLearner, GaussianEnsemble, HopperMorph
+        >>> env = HopperMorph(num_runs=1, seed=0)
+        >>> one, other = (DynamicsLearner(GaussianEnsemble.for_env(env, num_cells=(8,))) for _ in range(2))
+        >>> other.load_state_dict(one.state_dict())
+        >>> torch.equal(one.weights_by_run()[0], other.weights_by_run()[0])
+        True
     """
 
     def __init__(
-        self, update: Callable[..., Tensor], weights: nn.Parameter, *, lr: float, weight_decay: float = 0.0
+        self,
+        networks: Mapping[str, nn.Module],
+        *,
+        lr: float,
+        weight_decay: float = 0.0,
+        num_runs: int | None,
+        precision: Precision,
     ) -> None:
-        assert weights.grad is not None
-        self._weights, self._gradient = weights, weights.grad
-        self._update = self._step = update
-        self._captures = captures(weights.device)
-        # Adam's fused kernel on CUDA reads it in float32, whatever the weights are.
-        self._lr = torch.tensor(lr, dtype=torch.float32, device=weights.device) if self._captures else lr
-        self._captured: object = None
-        self.optimiser = torch.optim.Adam(
-            [weights], lr=self._lr, weight_decay=weight_decay, fused=True, capturable=self._captures
-        )
+        if precision not in get_args(Precision):
+            raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
+        self.num_runs, self._laid_out = num_runs, dict(networks)
+        self._weights = nn.Parameter(share_storage(self._parameters()))
+        self._weights.grad = self._gradient = torch.zeros_like(self._weights.detach())
+        for network in networks.values():
+            save_alone(network)
+        # Products read these: the weights themselves, or a copy in bfloat16 that every update renews.
+        self._read_weights = in_precision(self._weights.detach(), precision)
+        self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
+        self.optimiser = self._updates.optimiser
 
-    def mean(self, batches: Iterable[Sequence[Tensor]]) -> Tensor:
-        """Do one update with the tensors of each batch; returns the mean of what the updates return."""
-        batches = list(batches)
-        sizes = [tensor.shape for tensor in batches[0]]
-        self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
-        if self._captures:
-            self._renew(sizes)
-        with torch.cuda.device_of(self._weights):  # a graph is captured on the current device
-            mean = torch.stack([self._step(*rows) for rows in batches]).mean(0)
-        if self._captures:
-            self._captured = self._constants(sizes)
-        return mean
+    def state_dict(self) -> dict[str, Any]:
+        """Return what learning has changed, and the shapes of the weights by name. Tensors are not copied."""
+        return self._buffers() | {"moments": dict(self._moments()), "shapes": shapes_of(self._laid_out)}
 
-    def _renew(self, sizes: list[torch.Size]) -> None:
-        """Write a new learning rate where the graph reads it; drop a graph of other sizes, settings or moments."""
-        group = self.optimiser.param_groups[0]
-        if group["lr"] is not self._lr:
-            self._lr.copy_(torch.as_tensor(group["lr"]))  # type: ignore[union-attr]
-            group["lr"] = self._lr
-        if self._captured != self._constants(sizes):
-            self._step = CudaGraphModule(self._update, device=self._weights.device)
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the learner that :meth:`state_dict` was read from.
 
-    def _constants(self, sizes: list[torch.Size]) -> tuple[Any, ...]:
-        """What a graph takes for granted: sizes, where the moments lie, the settings but for the learning rate."""
-        moments = [moment.data_ptr() for moment in self.optimiser.state.get(self._weights, {}).values()]
-        settings = self.optimiser.param_groups[0].items()
-        return sizes, moments, {name: value for name, value in settings if name not in ("params", "lr")}
+        A state without shapes, from before they were saved, is compared by its number of weights alone.
 
+        Raises:
+            ValueError: if the networks of that learner have other sizes; nothing is changed then.
+        """
+        own = self._buffers()
+        check_state(state_dict, own, shapes_of(self._laid_out))
+        for name, tensor in own.items():
+            tensor.copy_(state_dict[name])
+        self._load_moments(state_dict["moments"])
 
-def captures(device: torch.device) -> bool:
-    """Whether updates on a device are captured as a graph."""
-    return device.type == "cuda"
+    def weights_by_run(self) -> list[Tensor]:
+        """Weights with the run axis first, ``[K, ...]``: views, not copies."""
+        return self._by_run(self._weights.detach(), self._parameters())
 
+    def moments_by_run(self) -> list[Tensor]:
+        """Adam's moments, as `weights_by_run` has the weights; none before its first step."""
+        moments = [moment for moment in self._moments().values() if moment.ndim]  # without the count of steps
+        return [part for moment in moments for part in self._by_run(moment, self._parameters())]
 
-def on_device(rows: TensorDictBase, device: torch.device) -> TensorDictBase:
-    """Rows where a learner is, as they are if they lie there: a replay may stay on the CPU."""
-    return rows if rows["observation"].device == device else rows.to(device)
+    def check_networks_lie_here(self) -> None:
+        """Refuse to go on with a network that was moved, or given to another learner, after this one was made.
+
+        Raises:
+            RuntimeError: if the weights of a network no longer lie in the flat buffer.
+        """
+        parts = self._parts(self._weights.detach())
+        for name, network in self._laid_out.items():
+            if any(one.data_ptr() != here.data_ptr() for one, here in zip(network.parameters(), parts[name])):
+                raise RuntimeError(f"the {name} was moved after its learner was made; make the learner last")
+
+    def _update_once(self, *rows: Tensor) -> Tensor:
+        """Write the gradients of one batch to `_gradient`, call ``optimiser.step()`` and return the losses."""
+        raise NotImplementedError
+
+    def _renew(self) -> None:
+        """Copy the weights to where products read them."""
+        if self._read_weights.dtype != self._weights.dtype:
+            self._read_weights.copy_(self._weights)
+
+    def _buffers(self) -> dict[str, Tensor]:
+        """Flat buffers that a state holds, by name."""
+        return {"weights": self._weights.detach()}
+
+    def _parameters(self) -> list[Tensor]:
+        return [parameter for network in self._laid_out.values() for parameter in network.parameters()]
+
+    def _parts(self, flat: Tensor) -> dict[str, list[Tensor]]:
+        """Views of a buffer of N numbers in the shapes of the parameters, by network."""
+        parts = iter(views(flat, self._parameters()))
+        return {name: [next(parts) for _ in network.parameters()] for name, network in self._laid_out.items()}
+
+    def _by_run(self, flat: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Consecutive parts of a buffer in the shapes of some tensors, with a run axis even if there is but one run."""
+        found = views(flat, tensors)
+        return found if self.num_runs is not None else [part.unsqueeze(0) for part in found]
+
+    def _moments(self) -> dict[str, Tensor]:
+        return self.optimiser.state.get(self._weights, {})
+
+    def _load_moments(self, moments: Mapping[str, Tensor]) -> None:
+        """Take moments; none are those of an Adam that has seen nothing.
+
+        In place where there are some: a captured CUDA graph goes on writing to these very moments. Copied where there
+        are none: `torch.optim.Optimizer.load_state_dict` would share them with whoever gave them.
+        """
+        state = self.optimiser.state[self._weights]
+        for moment in state.values():
+            moment.zero_()
+        for name, moment in moments.items():
+            if name in state:
+                state[name].copy_(moment)
+            else:
+                # Adam counts its steps on the CPU, unless it can be captured in a graph.
+                on_gpu = self.optimiser.defaults.get("capturable", False) or moment.ndim > 0
+                state[name] = moment.detach().to(self._weights.device if on_gpu else "cpu", copy=True)
 
 
 def share_storage(tensors: Sequence[Tensor]) -> Tensor:
@@ -99,18 +176,64 @@ def views(flat: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors)]
 
 
-def by_run(flat: Tensor, tensors: Sequence[Tensor], num_runs: int | None) -> list[Tensor]:
-    """Consecutive parts of a flat buffer in the shapes of some tensors, with a run axis even where there is but one."""
-    found = views(flat.detach(), tensors)
-    return found if num_runs is not None else [part.unsqueeze(0) for part in found]
+def in_precision(flat: Tensor, precision: Precision) -> Tensor:
+    """Return what products read of a flat buffer: the buffer itself, or a copy in bfloat16."""
+    return flat.to(torch.bfloat16) if precision == "bfloat16" else flat
 
 
-def moments_by_run(
-    optimiser: torch.optim.Optimizer, weights: nn.Parameter, tensors: Sequence[Tensor], num_runs: int | None
-) -> list[Tensor]:
-    """Moments of an optimiser of one flat buffer, as :func:`by_run` has the buffer itself."""
-    moments = [moment for moment in optimiser.state.get(weights, {}).values() if moment.ndim]
-    return [part for moment in moments for part in by_run(moment, tensors, num_runs)]
+@torch.no_grad()
+def read_networks(networks: Mapping[str, nn.Module], state_dict: Mapping[str, Any]) -> None:
+    """Read networks out of the state of a learner.
+
+    Args:
+        networks: by name, as the learner had them; their weights are written over.
+        state_dict: as `FlatLearner.state_dict` returns it.
+
+    Raises:
+        ValueError: if the learner's networks have other sizes; nothing is changed then.
+    """
+    parameters = [parameter for network in networks.values() for parameter in network.parameters()]
+    flat = torch.cat([parameter.reshape(-1) for parameter in parameters])
+    check_state(state_dict, {"weights": flat}, shapes_of(networks))
+    for parameter, values in zip(parameters, views(state_dict["weights"], parameters)):
+        parameter.copy_(values)
+
+
+def shapes_of(networks: Mapping[str, nn.Module]) -> dict[str, tuple[int, ...]]:
+    """Shapes of all weights by name, in the order of the flat buffer.
+
+    Example:
+        >>> shapes_of({"policy": nn.Sequential(nn.Linear(5, 8))})
+        {'policy.0.weight': (8, 5), 'policy.0.bias': (8,)}
+    """
+    return {
+        f"{name}.{key}": tuple(parameter.shape)
+        for name, network in networks.items()
+        for key, parameter in network.named_parameters()
+    }
+
+
+def check_state(state: Mapping[str, Any], own: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse a state of other networks before anything is copied.
+
+    Args:
+        state: as `FlatLearner.state_dict` returns it, with shapes or without.
+        own: the flat buffers that are to be written over, by name.
+        shapes: of the weights, by name.
+
+    Raises:
+        ValueError: naming the first weight that differs, or the number of weights if the state has no shapes.
+    """
+    theirs = state.get("shapes", shapes)
+    for name in {**shapes, **theirs}:
+        wanted, found = shapes.get(name, "missing"), theirs.get(name, "missing")
+        if wanted != found:
+            raise ValueError(f"{name} is {found} in the state and {wanted} in this learner; {WAY_OUT}")
+    for name, tensor in own.items():
+        if state[name].shape != tensor.shape:
+            raise ValueError(
+                f"the state holds {state[name].numel()} {name}, this learner has {tensor.numel()}; {WAY_OUT}"
+            )
 
 
 def save_alone(module: nn.Module) -> None:
@@ -124,31 +247,3 @@ def _copied(module: nn.Module, state_dict: dict[str, Any], prefix: str, local_me
     for name, _ in module.named_parameters(recurse=False):
         if not isinstance(state_dict[prefix + name], nn.Parameter):  # as ``keep_vars=True`` wants them
             state_dict[prefix + name] = state_dict[prefix + name].clone()
-
-
-def check_sizes(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
-    """Refuse a state of other networks before anything is copied."""
-    for name, tensor in own.items():
-        if given[name].shape != tensor.shape:
-            raise ValueError(
-                f"the state holds {given[name].numel()} {name}, this learner has {tensor.numel()}; make it with the "
-                "sizes, the number of critics or members and the number of runs that the state was saved with"
-            )
-
-
-def load_moments(optimiser: torch.optim.Optimizer, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
-    """Take the moments of an optimiser of one parameter; none are those of one that has seen nothing.
-
-    In place where there are some: a captured CUDA graph goes on writing to these very moments. Copied where there are
-    none: `torch.optim.Optimizer.load_state_dict` would share them with whoever gave them.
-    """
-    state = optimiser.state[parameter]
-    for moment in state.values():
-        moment.zero_()
-    for name, moment in moments.items():
-        if name in state:
-            state[name].copy_(moment)
-        else:
-            # Adam counts its steps on the CPU, unless it can be captured in a graph.
-            on_gpu = optimiser.defaults.get("capturable", False) or moment.ndim > 0
-            state[name] = moment.detach().to(parameter.device if on_gpu else "cpu", copy=True)

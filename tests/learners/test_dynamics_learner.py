@@ -184,10 +184,10 @@ def test_bad_input_is_named(make_rows: Rows) -> None:
     fleet = DynamicsLearner(ensemble_on(make_rows(2, 8, 3), num_runs=3), num_runs=3)
     with pytest.raises(ValueError, match=r"\[3, 12\] needs num_runs=3 as its last dimension"):
         fleet.observe(make_rows(3, 12))  # as a rollout is, [K, T]
-    with pytest.raises(RuntimeError, match="moved after its learner was made"):
+    with pytest.raises(RuntimeError, match="the ensemble was moved after its learner was made; make the learner last"):
         deepcopy(learner).update(batches)
     learner.ensemble.float()
-    with pytest.raises(RuntimeError, match="moved after its learner was made"):
+    with pytest.raises(RuntimeError, match="the ensemble was moved after its learner was made; make the learner last"):
         learner.update(batches)
 
 

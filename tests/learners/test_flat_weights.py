@@ -1,177 +1,157 @@
-"""Updates over one flat buffer. A recording of operators stands in for a CUDA graph: it, too, repeats what it saw."""
+"""What both learners share: a flat buffer of weights, and a state that other networks refuse."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten
 from toy_env import ToyEnv
+from toy_learners import dynamics_learner, sac_learner
 
-import coim.learners.flat_weights
-import coim.learners.sac
-from coim import DynamicsLearner, GaussianEnsemble, SACLearner, make_policy, make_qvalue
+from coim import GaussianEnsemble
+from coim.learners import FlatLearner
+from coim.learners.flat_weights import read_networks
 
 Rows = Callable[..., TensorDict]
+Make = Callable[..., FlatLearner]
+EACH = [sac_learner, dynamics_learner]
 
 
-class Recording(TorchDispatchMode):
-    """Runs a function twice, and after that only the operators of the second time, on the very same tensors."""
-
-    made: list[Recording] = []  # noqa: RUF012
-
-    def __init__(self, function: Callable[..., Tensor], *, device: torch.device) -> None:
-        super().__init__()
-        self.function, self.device = function, device
-        self.calls: list[tuple[Any, ...]] = []
-        self.warm = False
-        self.made.append(self)
-
-    def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        out = operator(*args, **(kwargs or {}))
-        self.calls.append((operator, args, kwargs or {}, out))
-        return out
-
-    def __call__(self, *rows: Tensor) -> Tensor:
-        if not self.warm:  # in the first call an optimiser makes its moments
-            self.warm = True
-            return self.function(*rows)
-        if not self.calls:
-            self.rows = [row.clone() for row in rows]
-            with self:
-                self.result = self.function(*self.rows)
-            return self.result.clone()
-        torch._foreach_copy_(self.rows, list(rows))
-        for operator, args, kwargs, recorded in self.calls:
-            for old, new in zip(tree_flatten(recorded)[0], tree_flatten(operator(*args, **kwargs))[0], strict=True):
-                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
-                    old.copy_(new)
-        return self.result.clone()
+def numbers(state: dict[str, Any]) -> list[Tensor]:
+    """Copies of all tensors of a state, and of the states within it."""
+    nested = (numbers(value) if isinstance(value, dict) else [value] for value in state.values())
+    return [value.clone() for values in nested for value in values if isinstance(value, Tensor)]
 
 
-@pytest.fixture
-def recordings(monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
-    """Let learners on the CPU capture their updates, as those on CUDA do."""
-    monkeypatch.setattr(Recording, "made", [])
-    monkeypatch.setattr(coim.learners.flat_weights, "CudaGraphModule", Recording)
-    for module in (coim.learners.flat_weights, coim.learners.sac):
-        monkeypatch.setattr(module, "captures", lambda device: True)
-    return Recording.made
-
-
-LR = 0.5**12  # exact in float32, in which a graph reads it
-
-
-def sac_learner(device: str = "cpu") -> SACLearner:
-    torch.manual_seed(0)
-    networks = (make(ToyEnv(), num_cells=(16,)).double().to(device) for make in (make_policy, make_qvalue))
-    learner, rng = SACLearner(*networks, lr=LR), torch.Generator().manual_seed(0)
-    learner._noise = lambda action: torch.randn(  # type: ignore[method-assign]
-        action.shape, generator=rng, dtype=action.dtype
-    ).to(action.device)
+def learnt(make: Make, make_rows: Rows, *runs: int, **sizes: Any) -> FlatLearner:
+    """A learner after two updates."""
+    learner = make(*runs, **sizes)
+    learner.update(make_rows(2, 8, *runs))  # type: ignore[attr-defined]
     return learner
 
 
-def dynamics_learner(device: str = "cpu") -> DynamicsLearner:
-    torch.manual_seed(0)
-    return DynamicsLearner(GaussianEnsemble.for_env(ToyEnv(), num_cells=(16,)).double().to(device), lr=LR)
+ALIKE = {
+    # As many numbers in policy and critics, in other layers.
+    "hidden units": (sac_learner, {"num_cells": (4, 4, 6)}, {"num_cells": (7, 1, 8)}, r"policy.layers.0.weight is .*4"),
+    "layers": (sac_learner, {"num_cells": (1, 8, 5)}, {"num_cells": (4, 7)}, "policy.layers.0.weight is "),
+    "hidden units of a model": (
+        dynamics_learner,
+        {"num_cells": (1, 6)},
+        {"num_cells": (4,)},
+        r"ensemble.layers.0.weight is \(3, 7, 1\) in the state and \(3, 7, 4\) in this learner",
+    ),
+    "members as runs": (
+        dynamics_learner,
+        {"num_runs": 2, "num_members": 3},
+        {"num_runs": 3, "num_members": 2},
+        r"ensemble.layers.0.weight is \(2, 3, 7, 16\) in the state and \(3, 2, 7, 16\) in this learner; make it with",
+    ),
+}
 
 
-def raise_the_rate(learner: Any) -> None:
-    learner.optimiser.param_groups[0]["lr"] = 0.5**6
+@pytest.mark.parametrize(("make", "theirs", "own", "sentence"), ALIKE.values(), ids=ALIKE)
+def test_a_state_with_as_many_numbers_in_other_shapes_is_refused(
+    make_rows: Rows, make: Make, theirs: dict[str, Any], own: dict[str, Any], sentence: str
+) -> None:
+    state, learner = make(**theirs).state_dict(), make(**own)
+    assert state["weights"].shape == learner.state_dict()["weights"].shape
+    before = numbers(learner.state_dict())
+    with pytest.raises(ValueError, match=sentence):
+        learner.load_state_dict(state)
+    assert all(map(torch.equal, numbers(learner.state_dict()), before))
 
 
-def schedule_the_rate(learner: Any) -> None:
-    learner.optimiser.param_groups[0]["lr"] *= 1.0
-    torch.optim.lr_scheduler.LambdaLR(learner.optimiser, lambda epoch: 0.25)
+@pytest.mark.parametrize(
+    ("theirs", "own", "sentence"),
+    [
+        ((16,), (16, 16), "policy.layers.2.weight is missing in the state and (16, 4) in this learner"),
+        ((16, 16), (16,), "policy.layers.2.weight is (16, 4) in the state and missing in this learner"),
+    ],
+)
+def test_a_layer_that_only_one_has_is_named(theirs: tuple[int, ...], own: tuple[int, ...], sentence: str) -> None:
+    """The shapes of all other layers agree."""
+    shapes = {layers: sac_learner(num_cells=layers).state_dict()["shapes"] for layers in (theirs, own)}
+    state = shapes[theirs] | {name: shape for name, shape in shapes[own].items() if name in shapes[theirs]}
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        sac_learner(num_cells=own).load_state_dict({"shapes": state})
 
 
-def forget_the_gradients(learner: Any) -> None:
-    learner.optimiser.zero_grad()
+@pytest.mark.parametrize("make", EACH)
+@pytest.mark.parametrize("num_runs", [None, 3])
+def test_a_state_from_before_shapes_were_saved_still_loads(make_rows: Rows, make: Make, num_runs: int | None) -> None:
+    runs = () if num_runs is None else (num_runs,)
+    expected, other = learnt(make, make_rows, *runs), make(num_runs, seed=1)
+    state = deepcopy(expected.state_dict())
+    assert list(state.pop("shapes"))[-1].endswith(".bias")
+    other.load_state_dict(state)
+    for learner in (expected, other):
+        learner.update(make_rows(2, 8, *runs, seed=1))  # type: ignore[attr-defined]
+    assert all(map(torch.equal, numbers(other.state_dict()), numbers(expected.state_dict())))
 
 
-def raise_the_betas(learner: Any) -> None:
-    learner.optimiser.param_groups[0]["betas"] = (0.5, 0.9)
+@pytest.mark.parametrize("make", EACH)
+def test_a_state_without_shapes_is_compared_by_its_size(make: Make) -> None:
+    state = {name: value for name, value in make(num_cells=(8,)).state_dict().items() if name != "shapes"}
+    held, own = (len(make(num_cells=cells).state_dict()["weights"]) for cells in ((8,), (16,)))
+    with pytest.raises(
+        ValueError, match=f"the state holds {held} weights, this learner has {own}; make it with the hi"
+    ):
+        make(num_cells=(16,)).load_state_dict(state)
 
 
-def forget_the_moments(learner: Any) -> None:
-    learner.optimiser.state.clear()
+@pytest.mark.parametrize("make", EACH)
+def test_the_shapes_are_those_of_the_weights_in_their_order(make: Make) -> None:
+    learner = make(2, num_cells=(4, 5))
+    shapes = list(learner.state_dict()["shapes"].values())
+    assert next(iter(learner.state_dict()["shapes"])) in ("policy.layers.0.weight", "ensemble.layers.0.weight")
+    assert shapes == [tuple(weights.shape) for weights in learner.weights_by_run()][: len(shapes)]
+    assert sum(map(math.prod, shapes)) == len(learner.state_dict()["weights"])
 
 
-def raise_alpha(learner: SACLearner) -> None:
-    learner.loss.alpha = 0.5
+@pytest.mark.parametrize("make", EACH)
+def test_a_single_run_and_a_fleet_of_one_are_two_things(make: Make) -> None:
+    with pytest.raises(ValueError, match=r"layers.0.weight is .* in the state and \(1, .* in this learner"):
+        make(1).load_state_dict(make(None).state_dict())
 
 
-def lower_gamma(learner: SACLearner) -> None:
-    learner.loss.gamma = 0.5
-
-
-def raise_tau(learner: SACLearner) -> None:
-    learner.tau = 0.5
-
-
-OF_BOTH = [raise_the_rate, schedule_the_rate, forget_the_gradients, raise_the_betas, forget_the_moments]
-OF_SAC = [raise_alpha, lower_gamma, raise_tau]
-
-
-EACH = [(make, change) for make in (sac_learner, dynamics_learner) for change in OF_BOTH]
-EACH += [(sac_learner, change) for change in OF_SAC]
-
-
-def changed_midway(learner: Any, change: Any, batches: TensorDict) -> dict[str, Tensor]:
-    """Weights, and targets of critics, after five updates, a change and five more."""
-    learner.update(batches[:5])
-    before = learner.state_dict()["weights"].clone()
-    change(learner)
-    learner.update(batches[5:])
+@pytest.mark.parametrize("make", EACH)
+@pytest.mark.parametrize("num_runs", [None, 3])
+def test_weights_and_moments_by_run_are_views(make_rows: Rows, make: Make, num_runs: int | None) -> None:
+    learner = learnt(make, make_rows, *(() if num_runs is None else (num_runs,)))
+    for found in (learner.weights_by_run(), learner.moments_by_run()):
+        assert {len(tensor) for tensor in found} == {num_runs or 1}
+        for tensor in found:
+            tensor[0] = 7.0
     state = learner.state_dict()
-    assert not torch.equal(state["weights"], before)
-    return {name: value.cpu() for name, value in state.items() if isinstance(value, Tensor) and name != "rng"}
+    for flat in (state["weights"], state["moments"]["exp_avg"], state["moments"]["exp_avg_sq"]):
+        assert int((flat == 7.0).sum()) == len(flat) / (num_runs or 1)
 
 
-@pytest.mark.parametrize(("make", "change"), EACH)
-def test_a_captured_update_follows_what_is_changed_after_it(
-    make_rows: Rows, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch, make: Any, change: Any
-) -> None:
-    captured = changed_midway(make(), change, make_rows(10, 8))
-    assert any(len(recording.calls) > 10 for recording in recordings)
-    monkeypatch.undo()
-    torch.testing.assert_close(captured, changed_midway(make(), change, make_rows(10, 8)), rtol=0, atol=1e-9)
+def test_an_optimiser_that_has_seen_nothing_has_no_moments() -> None:
+    assert sac_learner().moments_by_run() == []
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize(("make", "change"), EACH)
-def test_a_cuda_graph_follows_what_is_changed_after_it(make_rows: Rows, make: Any, change: Any) -> None:
-    if not torch.cuda.is_available():
-        pytest.skip("needs a CUDA device")
-    on_gpu, on_cpu = (changed_midway(make(device), change, make_rows(10, 8)) for device in ("cuda", "cpu"))
-    torch.testing.assert_close(on_gpu, on_cpu, rtol=0, atol=1e-9)
+def test_networks_are_read_out_of_a_state(make_rows: Rows) -> None:
+    learner = learnt(dynamics_learner, make_rows)
+    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_cells=(16, 16)).double()
+    read_networks({"ensemble": ensemble.network}, learner.state_dict())
+    own = learner.ensemble.network  # type: ignore[attr-defined]
+    assert all(map(torch.equal, ensemble.network.parameters(), own.parameters()))
+    other = GaussianEnsemble.for_env(ToyEnv(), num_cells=(1, 6)).double().network
+    before = [parameter.clone() for parameter in other.parameters()]
+    with pytest.raises(ValueError, match=r"ensemble.layers.0.weight is \(3, 7, 4\) in the state and \(3, 7, 1\)"):
+        read_networks({"ensemble": other}, dynamics_learner(num_cells=(4,)).state_dict())
+    assert all(map(torch.equal, other.parameters(), before))
 
 
-@pytest.mark.parametrize("make", [sac_learner, dynamics_learner])
-def test_updates_are_captured_once_on_the_device_of_the_weights(
-    make_rows: Rows, recordings: list[Recording], make: Any
-) -> None:
-    learner = make()
-    for rate in (1e-3, 1e-4, 1e-5):
-        learner.optimiser.param_groups[0]["lr"] = rate
-        learner.update(make_rows(3, 8))
-    assert [recording.device for recording in recordings] == [torch.device("cpu")]
-
-
-@pytest.mark.parametrize("make", [sac_learner, dynamics_learner])
-def test_batches_of_another_size_are_captured_anew(make_rows: Rows, recordings: list[Recording], make: Any) -> None:
-    learner = make()
-    for size in (8, 1, 8):  # a graph's copy of its input would repeat the one row eight times
-        learner.update(make_rows(3, size, 1))
-    assert [recording.rows[0].shape[-2] for recording in recordings] == [8, 1, 8]
-
-
-def test_updates_are_captured_on_cuda_alone() -> None:
-    assert coim.learners.flat_weights.captures(torch.device("cuda", 1))
-    assert not coim.learners.flat_weights.captures(torch.device("cpu"))
+@pytest.mark.parametrize("make", EACH)
+def test_an_unknown_precision_is_refused(make: Make) -> None:
+    with pytest.raises(ValueError, match="precision='float16' is unknown; choose 'float32' or 'bfloat16'"):
+        make(precision="float16")

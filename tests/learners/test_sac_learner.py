@@ -1,4 +1,4 @@
-"""Learners: what an update is, what `start_from` copies, and that runs do not meet."""
+"""The SAC learner: what an update is, what `start_from` copies, and that runs do not meet."""
 
 from __future__ import annotations
 
@@ -11,25 +11,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 from toy_env import ToyEnv
+from toy_learners import LR, give_noise, sac_learner
 
 from coim import CoImSACLoss, SACLearner, make_policy, make_qvalue, select_run
 
 Rows = Callable[..., TensorDict]
-LR = 0.5**12  # exact in float32, in which a CUDA graph reads it
-
-
-def sac_learner(num_runs: int | None = None, *, seed: int = 0, **kwargs: float) -> SACLearner:
-    torch.manual_seed(seed)
-    env = ToyEnv()
-    policy = make_policy(env, num_cells=(16, 16), num_runs=num_runs).double()
-    qvalue = make_qvalue(env, num_cells=(16, 16), num_runs=num_runs).double()
-    return SACLearner(policy, qvalue, num_runs=num_runs, seed=seed, **kwargs)
-
-
-def give_noise(learner: SACLearner, noise: list[torch.Tensor]) -> None:
-    """Let a learner draw this noise instead of its own."""
-    drawn = iter(noise)
-    learner._noise = lambda action: next(drawn)  # type: ignore[method-assign]
 
 
 def weights(learner: SACLearner) -> dict[str, torch.Tensor]:
@@ -81,13 +67,7 @@ def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(make_rows: Rows) -
 def test_compiled_float32_updates_of_a_fleet_equal_the_plain_ones(make_rows: Rows) -> None:
     """Also after alpha, gamma, tau and the learning rate were changed: none is a constant of what was compiled."""
 
-    def learner(compile: bool) -> SACLearner:
-        torch.manual_seed(0)
-        policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=3)
-        qvalue = make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=3)
-        return SACLearner(policy, qvalue, num_runs=3, compile=compile)
-
-    plain, quick = learner(False), learner(True)
+    plain, quick = (sac_learner(3, dtype=torch.float32, compile=compile) for compile in (False, True))
     for seed in (0, 1):
         batches = make_rows(20, 16, 3, dtype=torch.float32, seed=seed)
         metrics, expected = quick.update(batches), plain.update(batches)
@@ -226,7 +206,7 @@ def test_a_saved_network_is_that_network_alone(make_rows: Rows, name: str) -> No
 def test_networks_that_were_moved_are_not_trained_in_silence(make_rows: Rows, which: str) -> None:
     learner = sac_learner()
     getattr(learner, which).float().double()
-    with pytest.raises(RuntimeError, match="moved after their learner was made; make the learner last"):
+    with pytest.raises(RuntimeError, match=f"the {which} was moved after its learner was made; make the learner last"):
         learner.update(make_rows(1, 4))
 
 
@@ -320,13 +300,7 @@ def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> N
     """Twenty updates, of which all but the first few replay a captured graph, and twenty more after a fresh start."""
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
-    torch.manual_seed(0)
-    learners = []
-    for device in ("cpu", "cuda"):
-        torch.manual_seed(0)
-        policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).double().to(device)
-        qvalue = make_qvalue(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).double().to(device)
-        learners.append(SACLearner(policy, qvalue, num_runs=num_runs, lr=LR))
+    learners = [sac_learner(num_runs, device=device, lr=LR) for device in ("cpu", "cuda")]
     on_cpu, on_gpu = learners
     for seed in (0, 1):
         batches = make_rows(20, 32, *([num_runs] if num_runs else []), seed=seed)

@@ -8,22 +8,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
-from toy_env import ToyEnv
+from toy_learners import sac_learner
 
-from coim import CoImSACLoss, SACLearner, make_policy, make_qvalue
+from coim import CoImSACLoss, SACLearner
 from coim.models.policy import LOG_SCALE_RANGE
 
 Rows = Callable[..., TensorDict]
 DOUBLE, SINGLE = torch.float64, torch.float32
-
-
-def learner(
-    num_runs: int | None = None, *, dtype: torch.dtype = DOUBLE, num_critics: int = 2, **kwargs: object
-) -> SACLearner:
-    torch.manual_seed(0)
-    policy = make_policy(ToyEnv(), num_cells=(16, 16), num_runs=num_runs).to(dtype)
-    qvalue = make_qvalue(ToyEnv(), num_critics=num_critics, num_cells=(16, 16), num_runs=num_runs).to(dtype)
-    return SACLearner(policy, qvalue, num_runs=num_runs, **kwargs)  # type: ignore[arg-type]
 
 
 def batch(make_rows: Rows, *shape: int, dtype: torch.dtype = DOUBLE, imagined: bool = True) -> TensorDict:
@@ -58,7 +49,7 @@ def written_out(learner: SACLearner, rows: TensorDict, noise: list[torch.Tensor]
 @pytest.mark.parametrize("num_runs", [None, 3])
 @pytest.mark.parametrize("num_critics", [1, 2, 3])
 def test_gradients_and_losses_equal_autograd(make_rows: Rows, mix: str, num_runs: int | None, num_critics: int) -> None:
-    subject = learner(num_runs, mix=mix, num_critics=num_critics, lr=0.0, tau=1e-12)
+    subject = sac_learner(num_runs, mix=mix, num_critics=num_critics, lr=0.0, tau=1e-12)
     rows = batch(make_rows, 40, *([num_runs] if num_runs else []))
     noise = [torch.randn_like(rows["action"]) for _ in range(2)]
     losses, gradient = written_out(subject, rows, noise)
@@ -73,8 +64,8 @@ def test_stacked_products_give_the_same_gradients_as_one_network_after_the_other
     """A GPU takes all runs in one product; the arithmetic can be tried on a CPU."""
     rows = batch(make_rows, 40, 3)
     noise = [torch.randn_like(rows["action"]) for _ in range(2)]
-    one_by_one, stacked = (learner(3, lr=0.0, tau=1e-12) for _ in range(2))
-    stacked._lay_out(stacked.policy.network.mlp, stacked.qvalue.module.mlp, "float32", stack_runs=True)
+    one_by_one, stacked = (sac_learner(3, lr=0.0, tau=1e-12) for _ in range(2))
+    stacked._cut_networks(one_by_one=False)
     assert len(one_by_one._networks) == 3
     assert len(stacked._networks) == 1
     expected, gradient = (written_out(subject, rows, noise) for subject in (one_by_one, stacked))
@@ -84,7 +75,7 @@ def test_stacked_products_give_the_same_gradients_as_one_network_after_the_other
 
 
 def test_a_clamped_log_scale_gets_no_gradient(make_rows: Rows) -> None:
-    subject = learner(lr=0.0, tau=1e-12)
+    subject = sac_learner(lr=0.0, tau=1e-12)
     last = subject.policy.network.mlp.layers[-1]
     with torch.no_grad():
         last.bias[2:] += torch.tensor([LOG_SCALE_RANGE[1] + 5, 0.0], dtype=DOUBLE)
@@ -105,7 +96,7 @@ def test_a_clamped_log_scale_gets_no_gradient(make_rows: Rows) -> None:
 def test_twenty_updates_end_where_the_loss_adam_and_soft_update_end(
     make_rows: Rows, mix: str, imagined: bool, dtype: torch.dtype, bound: float, num_runs: int | None
 ) -> None:
-    subject, reference = (learner(num_runs, dtype=dtype, mix=mix) for _ in range(2))
+    subject, reference = (sac_learner(num_runs, dtype=dtype, mix=mix) for _ in range(2))
     loss = CoImSACLoss(reference.policy, reference.qvalue, mix=mix, num_runs=num_runs)  # type: ignore[arg-type]
     targets = SoftUpdate(loss, tau=0.005)
     optimiser = torch.optim.Adam(loss.parameters(), lr=3e-4)
@@ -129,7 +120,7 @@ def test_twenty_updates_end_where_the_loss_adam_and_soft_update_end(
 
 def test_bfloat16_products_stay_near_float32(make_rows: Rows) -> None:
     """Stated bounds: 1 % on each loss, 3 % on the whole gradient (in norm), weights still float32."""
-    single, half = (learner(dtype=SINGLE, lr=0.0, tau=1e-12, precision=p) for p in ("float32", "bfloat16"))
+    single, half = (sac_learner(dtype=SINGLE, lr=0.0, tau=1e-12, precision=p) for p in ("float32", "bfloat16"))
     rows = batch(make_rows, 256, dtype=SINGLE)
     noise = [torch.randn_like(rows["action"]) for _ in range(2)]
     expected, actual = (written_out(subject, rows, noise) for subject in (single, half))
@@ -141,6 +132,6 @@ def test_bfloat16_products_stay_near_float32(make_rows: Rows) -> None:
 
 def test_unknown_precision_and_tau_are_refused() -> None:
     with pytest.raises(ValueError, match="choose 'float32' or 'bfloat16'"):
-        learner(precision="float16")
+        sac_learner(precision="float16")
     with pytest.raises(ValueError, match=r"tau=0 is outside \(0, 1\]"):
-        learner(tau=0)
+        sac_learner(tau=0)

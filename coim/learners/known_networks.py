@@ -1,13 +1,12 @@
-"""What the gradients written out in `coim.objectives` are right for: networks of `coim.models` as they were made, and
-rows of single steps that count alike.
+"""Networks that the learners know the gradients of: those of `coim.models`, as they were made.
+
+`coim.objectives.gradients` and `coim.objectives.dynamics_gradients` compute the gradients of these networks and of no
+others. A network that computes something else would be trained wrongly in silence, so it is refused.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import SafeProbabilisticModule, TanhNormal
@@ -19,8 +18,6 @@ from coim.models.policy import Policy, PolicyNetwork
 from coim.models.qvalue import QValue, QValueNetwork
 from coim.models.scaling import InputScaling
 from coim.models.stacked import StackedLinear, StackedMLP
-from coim.objectives.dynamics import check_one_step
-from coim.objectives.sac import CoImSACLoss
 
 STACKED = (nn.ModuleList, StackedMLP, StackedLinear)
 SAC = (Policy, PolicyNetwork, QValue, QValueNetwork, TensorDictModule, SafeProbabilisticModule, InputScaling)
@@ -28,11 +25,11 @@ OF_SAC, OF_ENSEMBLE = (*STACKED, *SAC, nn.ReLU), (*STACKED, GaussianEnsemble, Ru
 
 
 def check_sac_networks(policy: Policy, qvalue: QValue) -> None:
-    """Refuse a policy or critics that compute something else, or do not see the same numbers.
+    """Refuse a policy or critics that compute something else, or that scale their inputs differently.
 
     Raises:
-        TypeError: naming the part that is another, or a weight that must not be trained.
-        ValueError: if the two scale their inputs differently, or are on other devices or in other dtypes.
+        TypeError: if a part computes something else, or a weight must not be trained; the message names it.
+        ValueError: if the two differ in the scaling of their inputs, in device or in dtype.
     """
     for network in (policy, qvalue):
         _check_parts(network, OF_SAC, "SACLearner", "CoImSACLoss")
@@ -51,10 +48,15 @@ def check_sac_networks(policy: Policy, qvalue: QValue) -> None:
 
 
 def check_exchangeable(own: tuple[Policy, QValue], others: tuple[Policy, QValue]) -> None:
-    """Refuse two learners of which one cannot take the weights of the other, or would mean something else by them.
+    """Refuse two learners that cannot start from each other's weights.
+
+    Args:
+        own: policy and critics of one learner.
+        others: policy and critics of the other.
 
     Raises:
-        ValueError: if their layers or their scalings differ.
+        ValueError: if their layers differ, or the scaling of their inputs: the same weights would then mean something
+            else.
     """
     pairs: list[tuple[nn.Module, nn.Module]] = list(zip(own, others, strict=True))
     for network, other in pairs:
@@ -71,33 +73,11 @@ def check_exchangeable(own: tuple[Policy, QValue], others: tuple[Policy, QValue]
         )
 
 
-def check_sac_rows(rows: TensorDictBase, keys: CoImSACLoss._AcceptedKeys) -> None:
-    """Refuse rows of which `CoImSACLoss` takes something into account that the gradients written out do not.
-
-    Args:
-        rows: ``[*B]``.
-        keys: those of the loss.
-
-    Raises:
-        ValueError: naming the key.
-    """
-    schema = asdict(CoImSACLoss.default_keys())
-    renamed = {name: key for name, key in asdict(keys).items() if key != schema[name] and name != "priority"}
-    if renamed:
-        raise ValueError(f"SACLearner reads rows by the keys of the schema, not by {renamed}; rename their entries")
-    check_one_step(rows, keys.steps_to_next_obs)
-    if keys.priority_weight in rows.keys(True):
-        raise ValueError(
-            f"rows with {keys.priority_weight!r}: SACLearner has no importance weights; train with CoImSACLoss, or "
-            "exclude() the key to count all rows alike"
-        )
-
-
 def check_ensemble(ensemble: GaussianEnsemble) -> None:
     """Refuse an ensemble that computes something else.
 
     Raises:
-        TypeError: naming the part that is another, or a weight that must not be trained.
+        TypeError: if a part computes something else, or a weight must not be trained; the message names it.
     """
     _check_parts(ensemble, OF_ENSEMBLE, "DynamicsLearner", "EnsembleNLLLoss")
 
@@ -118,7 +98,7 @@ def _check_parts(network: nn.Module, kinds: tuple[type[nn.Module], ...], learner
 
 
 def _same_scaling(one: InputScaling | None, other: InputScaling | None) -> bool:
-    """Whether two networks see the same numbers."""
+    """Whether two scalings make the same numbers of the same inputs."""
     if one is None or other is None:
         return one is other
     return all(torch.equal(a.to(b), b) for a, b in zip(one.buffers(), other.buffers(), strict=True))
