@@ -1,9 +1,9 @@
-"""What the parts of Algorithm 1 must agree on, checked when they are put together.
+"""Check that the parts of Algorithm 1 fit together when they are put together.
 
-Parts that do not fit would run for hours until one of them is needed, or to the end with wrong numbers. Each check
-names the part, what it should be, and the way out.
+Parts that do not fit would run for hours until one of them is needed, or to the end with wrong numbers. Each error
+names the part, what it should be, and the way out. `coim.DesignChoice` and `coim.ImaginedReplay` check themselves.
 
-Shapes: K runs, I first designs, N rows that are tried, D design, S observation, A action.
+Shapes: K runs, S observation, A action, D design.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from coim.models.ensemble import GaussianEnsemble
 
 
 def check_counts(counts: Mapping[str, int], updates: Mapping[str, int]) -> None:
-    """Refuse what is no whole number, counts below 1 and updates below 0, by their names."""
+    """Refuse counts below 1, updates below 0, and numbers that are not whole; errors name them."""
     for name, count in {**counts, **updates}.items():
         if isinstance(count, bool) or not isinstance(count, Integral):
             raise ValueError(f"{name} is {count!r}, it must be a whole number")
@@ -38,7 +38,7 @@ def check_counts(counts: Mapping[str, int], updates: Mapping[str, int]) -> None:
 
 
 def check_words(**options: tuple[str, Sequence[str]]) -> None:
-    """Refuse a word that an option, by its name, does not know."""
+    """Refuse an unknown word; an option's name is given with its word and the words that it knows."""
     for name, (word, known) in options.items():
         if word not in known:
             choices = ", ".join(repr(one) for one in known[:-1]) + f" or {known[-1]!r}"
@@ -46,14 +46,14 @@ def check_words(**options: tuple[str, Sequence[str]]) -> None:
 
 
 def check_kinds(parts: Mapping[str, tuple[object, *tuple[type, ...]]]) -> None:
-    """Refuse a part, by its name, that is of none of the types that follow it; the first of them is the one to pass."""
+    """Refuse a part that has none of the types behind it; an error asks for the first of them."""
     for name, (part, *kinds) in parts.items():
         if not isinstance(part, tuple(kinds)):
             raise TypeError(f"{name} is a {type(part).__name__}; pass a {kinds[0].__name__}")
 
 
 def check_bodies(env: MorphEnv, evaluation_env: MorphEnv) -> None:
-    """Refuse bodies behind transforms, and evaluation bodies that are those of training or are paid otherwise."""
+    """Refuse bodies behind transforms, and evaluation bodies that are those of training or have other rewards."""
     for name, bodies in (("env", env), ("evaluation_env", evaluation_env)):
         if not isinstance(bodies, MorphEnv):
             raise TypeError(
@@ -88,10 +88,10 @@ def check_learners(
     *,
     side_by_side: bool,
 ) -> torch.device:
-    """Refuse learners that share weights, lack the run axis of the bodies, or live apart.
+    """Refuse learners that share weights, lack the run axis of the bodies, or are on different devices.
 
     Returns:
-        The device of all of them.
+        Their device.
     """
     if population is individual:
         raise ValueError("population and individual are one learner; make two, with networks of their own")
@@ -151,7 +151,7 @@ def check_networks(
 
 
 def check_buffers(env: MorphEnv, buffers: Buffers, *, imagined_rows: int) -> None:
-    """Refuse buffers that are one, are for other runs, live apart, or are too small for what is stored at once."""
+    """Refuse buffers that are shared, for other runs, on different devices, or too small for what is stored at once."""
     parts = {field.name: getattr(buffers, field.name) for field in fields(buffers)}
     if len({id(buffer) for buffer in parts.values()}) < len(parts):
         raise ValueError(
@@ -182,7 +182,7 @@ def sizes_of(env: MorphEnv | WorldModelEnv) -> dict[str, int]:
 
 
 def check_model(env: MorphEnv, model: object) -> None:
-    """Refuse a model of other bodies, or of other runs; one that is not known here is believed."""
+    """Refuse a model of other bodies or other runs; a model of another class is not checked."""
     if isinstance(model, SimulatorDynamics) and type(model.bodies) is not type(env):
         raise ValueError(
             f"the dream simulates a {type(model.bodies).__name__}, the bodies are of {type(env).__name__}; simulate "

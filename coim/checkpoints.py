@@ -1,7 +1,7 @@
-"""What a checkpoint on disk is, for whoever reads one; `coim.experiments.run.checkpoint` writes them.
+"""Read checkpoints of a run from disk; `coim.experiments.run.checkpoint` writes them.
 
 A run's ``checkpoint/`` holds a folder of `torchrl.checkpoint` for each of the last two checkpoints. TorchRL gives the
-format and the adapters; the checksums beside them, by which a damaged one is known, are ours.
+format and the adapters. The checksums beside them, which tell a damaged checkpoint, are ours.
 
 References:
     TorchRL: `torchrl.checkpoint <https://docs.pytorch.org/rl>`_.
@@ -18,13 +18,13 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
-FORMAT = 2  # of what is in a checkpoint; another one is refused
+FORMAT = 2  # version of what a checkpoint contains; another one is refused
 CHECKSUMS = "sha256.json"
 PREFIX = "checkpoint"
 
 
 class Held:
-    """A state between a file and what it belongs to, so that nothing is changed before all of it is read."""
+    """Hold a state that is read from a file, so that nothing is changed before all of it is read."""
 
     def __init__(self, state: Mapping[str, Any] | None = None) -> None:
         self.state = dict(state or {})
@@ -37,10 +37,10 @@ class Held:
 
 
 def newest_whole(folder: Path, complaint: Callable[[Path], str | None]) -> tuple[Path | None, dict[Path, str]]:
-    """The newest checkpoint that nothing is wrong with; nothing is touched.
+    """Find the newest checkpoint that nothing is wrong with, and change no file.
 
     Args:
-        folder: ``checkpoint/`` of a run.
+        folder: a run's ``checkpoint/``.
         complaint: says what is wrong with a checkpoint, or None; see `files_complaint`.
 
     Returns:
@@ -61,7 +61,7 @@ def newest_whole(folder: Path, complaint: Callable[[Path], str | None]) -> tuple
 
 
 def files_complaint(path: Path) -> str | None:
-    """What is wrong with the files of a checkpoint, or None."""
+    """Say what is wrong with the files of a checkpoint; None if nothing is."""
     try:
         expected = json.loads((path / CHECKSUMS).read_text())
         actual = checksums(path)
@@ -78,7 +78,7 @@ def checksums(folder: Path) -> dict[str, str]:
 
 
 def read_notes(path: Path) -> dict[str, Any]:
-    """The plain JSON that was saved with a checkpoint.
+    """Read the plain JSON that was saved with a checkpoint.
 
     Raises:
         ValueError: if it was written in another format than this version's.
@@ -103,10 +103,10 @@ def state_parts(states: Mapping[str, Any], notes: dict[str, Any]) -> Checkpoint:
 
 
 def read_state(path: Path, part: str, *, device: torch.device | str | None = None) -> dict[str, Any]:
-    """The state of one part of a checkpoint; the others are left alone.
+    """Read the state of one part of a checkpoint.
 
     Args:
-        path: of the checkpoint.
+        path: the checkpoint's folder.
         part: its name.
         device: where its tensors go; None puts them where they were.
     """

@@ -41,7 +41,7 @@ class Situation:
         population: learner that has seen all designs so far.
         buffers: rows of all designs so far; ``s0`` has their start states, ``pop`` every state that was visited.
         tried: designs whose episodes are over, in the order of building, each with its kind and its best return
-            ``[K]``. A run that was begun by version 0.1 has only those that came after it was resumed.
+            ``[K]``. A run that was begun before they were kept lacks its earlier ones.
         diverged: runs that have diverged, and where. They need no new body.
     """
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,90 @@ def library() -> list[tuple[Path, str]]:
     sources = sorted((ROOT / "coim").rglob("*.py"))
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in sources]
     return list(zip(sources, names))
+
+
+def imported(sources: Mapping[str, tuple[str, bool]]) -> dict[str, set[str]]:
+    """Modules that each of some modules imports, for type checking only included.
+
+    Args:
+        sources: text of each module, and whether it is a package's ``__init__``.
+    """
+    graph: dict[str, set[str]] = {}
+    for module, (source, is_package) in sources.items():
+        graph[module] = set()
+        for name in imports(ast.parse(source), module, is_package=is_package):
+            while name and name not in sources:  # `from coim.designs import KnownDesigns` names no module
+                name = name.rpartition(".")[0]
+            graph[module] |= {name} - {"", module}
+    return graph
+
+
+def by_folder(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
+    """The same for the folders of ``coim`` and of ``coim.experiments``, and for the modules beside them."""
+
+    def folder(module: str) -> str:
+        return ".".join(module.split(".")[: 3 if module.startswith("coim.experiments.") else 2])
+
+    folders: dict[str, set[str]] = {}
+    for module, names in graph.items():
+        folders.setdefault(folder(module), set()).update({folder(name) for name in names} - {folder(module)})
+    return folders
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    """A circle of imports, from a module to itself; empty if there is none."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+LIBRARY = imported({module: (path.read_text(), path.name == "__init__.py") for path, module in library()})
+
+
+def test_there_is_no_circle_of_imports() -> None:
+    assert len(LIBRARY) > 100
+    assert circle(LIBRARY) == []
+    assert circle(by_folder(LIBRARY)) == []
+
+
+def test_nothing_outside_of_the_experiments_imports_them() -> None:
+    outside = {module: names for module, names in LIBRARY.items() if not module.startswith("coim.experiments")}
+    assert outside
+    assert {m: names for m, names in outside.items() if any(n.startswith("coim.experiments") for n in names)} == {}
+
+
+def test_commands_import_none_of_each_other() -> None:
+    commands = {module: names for module, names in LIBRARY.items() if module.startswith("coim.experiments.commands.")}
+    assert commands
+    assert {module: names & commands.keys() for module, names in commands.items() if names & commands.keys()} == {}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "from coim.one import f",
+        "from coim import one",
+        "def late():\n    import coim.one",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .one import f",
+    ],
+)
+def test_a_circle_is_found(other: str) -> None:
+    sources = {"coim": ("", True), "coim.one": ("from coim.two import g", False), "coim.two": (other, False)}
+    assert set(circle(imported(sources))) == {"coim.one", "coim.two"}
+
+
+def test_a_circle_of_folders_is_found_where_no_two_modules_are_in_one() -> None:
+    sources = {
+        "coim.a.one": "from coim.b.one import f",
+        "coim.a.two": "",
+        "coim.b.one": "",
+        "coim.b.two": "from coim.a.two import g",
+    }
+    graph = imported({module: (source, False) for module, source in sources.items()})
+    assert circle(graph) == []
+    assert set(circle(by_folder(graph))) == {"coim.a", "coim.b"}
 
 
 @pytest.mark.parametrize(("path", "module"), library(), ids=[name for _, name in library()])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = [
+SOURCES = sorted((ROOT / "coim").glob("*.py")) + [
     path
     for folder in ("coim/designs", "coim/envs", "coim/learners", "coim/models", "coim/objectives", "recipes")
     for path in sorted((ROOT / folder).rglob("*.py"))

@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from coim.coadaptation import CoAdaptation
 from coim.envs import MorphEnv
@@ -20,7 +19,7 @@ from coim.experiments.run.best_policies import BestPolicies
 from coim.experiments.run.build import build
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.command_line import parse
-from coim.experiments.run.followed import Followed
+from coim.experiments.run.followed import Followed, FollowedT
 from coim.experiments.run.forecast import Forecast, work_of
 from coim.experiments.run.interrupt import (
     Stopped,
@@ -69,21 +68,20 @@ def train(
     body: type[MorphEnv],
     name: str,
     settings: Settings,
-    make: Callable[[Path, int, bool], Any],
+    make: Callable[[Path, int, bool], FollowedT],
     *,
     again: str,
-    finish: Callable[[Any, Path], None] | None = None,
+    finish: Callable[[FollowedT, Path], None] | None = None,
 ) -> Path:
     """Follow Algorithm 1 in a folder of its own, which can be gone on with after any end.
 
     Args:
         body: the environment.
-        name: of the environment, the first part of the folder's name.
+        name: the environment's name, the first part of the folder's name.
         settings: everything else; ``resume`` names the folder of a run to go on with.
-        make: a `CoAdaptation`, or what can stand for one, from its folder, its threads and whether its learners go
-            side by side.
-        again: the line that goes on with a run, but for its folder.
-        finish: what is left to do with an algorithm that is through.
+        make: makes the algorithm from its folder, its threads and whether its learners go side by side.
+        again: the command that goes on with a run, without its folder.
+        finish: called when the algorithm has ended, with its folder.
 
     Returns:
         The folder.

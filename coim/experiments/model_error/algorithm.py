@@ -1,4 +1,4 @@
-"""Algorithm 1 with a model of each kind beside it, measured while it runs.
+"""Measure a model of each kind while Algorithm 1 runs.
 
 Shapes: K runs, N rows.
 
@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from coim.coadaptation import CoAdaptation
-from coim.designs import NoisyDesigns, RandomDesigns
+from coim.designs import DesignGenerator, NoisyDesigns, RandomDesigns
 from coim.envs import MorphEnv
 from coim.events import DesignChosen, EpisodeDone, Event
 from coim.experiments.model_error.errors import change_variance, mean_squares, persistence_error, prediction_error
@@ -40,29 +40,30 @@ LAYOUT = Layout(
 
 
 class ProbedCoAdaptation:
-    """An algorithm that goes on exactly as it would alone, while two models are measured after its episodes.
+    """Follow an algorithm, which goes on exactly as it would alone, and measure two models after its episodes.
 
-    One model is the algorithm's own. The other one differs in what it predicts (the change of the observation, or the
-    next one) and in nothing else: the same first weights, and after each episode the same batches of Replay_Pop.
+    One model is the algorithm's own. The other one predicts the change of the observation where the first one predicts
+    the next observation, or the other way round. Nothing else differs: the first weights are the same, and after each
+    episode the batches of Replay_Pop.
 
-    What is measured, each on ``num_rows`` rows (`seen`: of each design):
+    Rows that they are measured on, ``num_rows`` of each kind (``seen``: of each design):
 
     =============  ===========================================================================================
     seen           an episode of every design so far, taken at its last measurement and kept out of the replay
     next           an episode of the next design by pi_Pop, before anything was learnt on it
     never built    episodes of eight uniform designs, by the current pi_Pop
-    noisy, random  states of ``seen`` whose design was swapped for N(xi, sigma^2) or a uniform one
+    noisy, random  states of ``seen`` with another design in place of their own, N(xi, sigma^2) or uniform
     ... possible   those of them in which no part of the new body is in the floor
     =============  ===========================================================================================
 
     Args:
-        algorithm: which imagines.
+        algorithm: one whose model imagines.
         other: the second learner, made by `other_learner`.
-        probes: what is measured on.
-        folder: of the run; `FILE` grows in it.
+        probes: collects the rows that models are measured on.
+        folder: the run folder; `FILE` grows in it.
         every: episodes of a design between two measurements; its last episode is always followed by one.
-        sigma: of the noisy designs.
-        seed: of what is drawn for the measurements.
+        sigma: standard deviation of the noisy designs.
+        seed: seeds all that is drawn for the measurements.
 
     Note:
         It is `Followed` as the algorithm itself is.
@@ -82,7 +83,10 @@ class ProbedCoAdaptation:
         self.algorithm, self.other, self.probes = algorithm, other, probes
         self.every, self.seed, self.path = every, seed, folder / FILE
         spec = algorithm.env.design_spec
-        self.swaps = {"noisy": NoisyDesigns(spec, sigma=sigma), "random": RandomDesigns(spec)}
+        self.swaps: dict[str, DesignGenerator] = {
+            "noisy": NoisyDesigns(spec, sigma=sigma),
+            "random": RandomDesigns(spec),
+        }
         self.seen: list[TensorDict] = []  # [R, K] of each design
         # The other model draws its batches as the algorithm's own does; from the same state on they are the same.
         self._rng = torch.Generator(algorithm.rngs["model"].device)
@@ -121,17 +125,16 @@ class ProbedCoAdaptation:
 
     @property
     def learners(self) -> dict[str, DynamicsLearner]:
-        """Both, by what they predict."""
-        return {learner.ensemble.predict: learner for learner in (self.algorithm.dynamics, self.other)}
+        """Both learners, by what they predict."""
+        return {learner.ensemble.predict: learner for learner in (own_learner(self.algorithm), self.other)}
 
     @property
     def updates_per_episode(self) -> int:
-        """The algorithm's, and those of the other model."""
+        """Updates of the algorithm's learners and of the other model."""
         return self.algorithm.updates_per_episode + self.training.plan.model_updates
 
     def __iter__(self) -> Iterator[Event]:
-        if self._table is None:
-            self._table = Table(self.path, COLUMNS)
+        self._begun_table()
         for event in self.algorithm:
             if isinstance(event, DesignChosen) and event.index > 0:
                 rows = self.probes.trajectory(self.algorithm.population.policy, event.design, seed=self._seed())
@@ -144,7 +147,7 @@ class ProbedCoAdaptation:
             yield event
 
     def state_dict(self) -> dict[str, Any]:
-        """The algorithm's, and all that the coming measurements depend on."""
+        """Return the algorithm's state and all that the coming measurements depend on."""
         probed = {
             "other": self.other.state_dict(),
             "rng": self._rng.get_state(),
@@ -174,11 +177,17 @@ class ProbedCoAdaptation:
         self.seen = [rows.to(self.algorithm.device) for rows in saved]
         self._table = Table(self.path, COLUMNS, keep=probed["csv_rows"])
 
+    def _begun_table(self) -> Table:
+        """The CSV file, with its header."""
+        if self._table is None:
+            self._table = Table(self.path, COLUMNS)
+        return self._table
+
     def _asked(self) -> dict[str, int]:
         return {"every": self.every, "rows": self.probes.num_rows}
 
     def _seed(self) -> int:
-        """A new one for each measurement, and nothing to remember."""
+        """A new seed for each measurement; nothing has to be saved for it."""
         return int(np.random.SeedSequence([self.seed, self.position.env_steps]).generate_state(1)[0] // 2)
 
     def _learn(self) -> None:
@@ -188,7 +197,7 @@ class ProbedCoAdaptation:
         self.training.train("model", self.other, rng=self._rng)
 
     def _measure(self, event: EpisodeDone) -> None:
-        """All that is measured after an episode."""
+        """Measure both models after an episode."""
         seed, policies = self._seed(), self.algorithm
         del self.seen[event.index :]
         self.seen.append(self.probes.trajectory(policies.individual.policy, event.design, seed=seed))
@@ -211,7 +220,7 @@ class ProbedCoAdaptation:
         *,
         impossible_share: torch.Tensor | None = None,
     ) -> None:
-        """A row for each run that still learns and each model, the last of which says that nothing changes."""
+        """Write a row for each run that still learns and each model; the last model predicts that nothing changes."""
         variance = change_variance(self.learners["delta"])
         valid = ~rows["next", "terminated"][..., 0]
         errors = {predict: prediction_error(one.ensemble, rows) for predict, one in self.learners.items()}
@@ -219,7 +228,7 @@ class ProbedCoAdaptation:
         episode = event.episode + 1 if isinstance(event, EpisodeDone) else 0
         counts, at = valid.sum(0).tolist(), (event.index + 1, episode, self.position.env_steps, probe)
         shares = [None] * len(counts) if impossible_share is None else impossible_share.tolist()
-        self._table.append(
+        self._begun_table().append(
             [run, *at, predict, *square, count, share]
             for predict, error in errors.items()
             for run, (square, count, share) in enumerate(
@@ -229,18 +238,27 @@ class ProbedCoAdaptation:
         )
 
 
-def other_learner(algorithm: CoAdaptation, **settings: Any) -> DynamicsLearner:
-    """A learner like the algorithm's own that predicts the other thing, with the same first weights.
-
-    Args:
-        algorithm: which has learnt nothing yet.
-        settings: of its `DynamicsLearner`.
+def own_learner(algorithm: CoAdaptation) -> DynamicsLearner:
+    """The learner of the algorithm's own model.
 
     Raises:
         ValueError: if the algorithm learns no model.
     """
     if algorithm.dynamics is None:
         raise ValueError("this run learns no model to measure; let an ensemble imagine, as with --imagine known")
-    twin = deepcopy(algorithm.dynamics.ensemble)
+    return algorithm.dynamics
+
+
+def other_learner(algorithm: CoAdaptation, **settings: Any) -> DynamicsLearner:
+    """A learner like the algorithm's own that predicts the other thing, with the same first weights.
+
+    Args:
+        algorithm: one that has learnt nothing yet.
+        settings: keywords of the `DynamicsLearner`.
+
+    Raises:
+        ValueError: if the algorithm learns no model.
+    """
+    twin = deepcopy(own_learner(algorithm).ensemble)
     twin.predict = "next" if twin.predict == "delta" else "delta"
     return DynamicsLearner(twin, num_runs=twin.num_runs, **settings)

@@ -18,7 +18,7 @@ from coim.learners.dynamics import DynamicsLearner
 
 
 class Model(Protocol):
-    """What is measured: a `coim.GaussianEnsemble`, or anything that predicts as it does."""
+    """A model to measure: a `coim.GaussianEnsemble`, or anything that predicts as it does."""
 
     def moments(self, observation: Tensor, action: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the next observation, each ``[R, K, E, S]``."""
@@ -34,7 +34,7 @@ def prediction_error(model: Model, rows: TensorDictBase) -> Tensor:
     in a run's CSV files is larger: the mean error of single members, of which a dream draws one for each transition.
 
     Args:
-        model: whose predictions are taken.
+        model: makes the predictions.
         rows: ``[R, K]`` transitions.
     """
     means, _ = model.moments(rows["observation"], rows["action"], rows["design"])
@@ -43,7 +43,7 @@ def prediction_error(model: Model, rows: TensorDictBase) -> Tensor:
 
 
 def persistence_error(model: Model, rows: TensorDictBase) -> Tensor:
-    """The same for the prediction that nothing changes, ``[R, K, S]``."""
+    """Error of predicting that nothing changes, ``[R, K, S]``."""
     return model.wrapped(rows["observation"] - rows["next", "observation"])
 
 
@@ -76,7 +76,7 @@ def change_variance(learner: DynamicsLearner) -> Tensor:
     """Variance of one-step changes in all that a learner of changes has observed, ``[S]`` or ``[K, S]``.
 
     Raises:
-        ValueError: if it learns the next observation itself: its statistics are of states.
+        ValueError: if it learns the next observation itself, and so has statistics of states.
     """
     if learner.ensemble.predict != "delta":
         raise ValueError(f"predict={learner.ensemble.predict!r} keeps no statistics of changes; pass the other learner")

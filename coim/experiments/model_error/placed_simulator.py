@@ -1,4 +1,4 @@
-"""The simulator set to any state and body: what a learnt model of the dynamics is compared with.
+"""Set the simulator to any state and body, to compare a learnt model of the dynamics with it.
 
 Shapes: N rows, S observation, D design, A action.
 """
@@ -16,12 +16,12 @@ from coim.pairs import IN_THE_FLOOR
 
 @dataclass(frozen=True)
 class Truth:
-    """What became of states under the simulator.
+    """Outcome of one step of the simulator.
 
     Attributes:
         next_observation: ``[N, S]``.
         depth: how far the lowest segment reached into the floor *before* the step, in m, ``[N]``.
-        broken: whether the simulation could not take the step, ``[N]``; its next observation means nothing.
+        broken: whether the simulation broke in the step, ``[N]``; the next observation then means nothing.
     """
 
     next_observation: Tensor
@@ -35,10 +35,10 @@ class Truth:
 
 
 class PlacedSimulator:
-    """Steps the simulator from states and bodies that need not belong together.
+    """Step the simulator from any pair of a state and a body.
 
     Args:
-        body: of the environment.
+        body: class of the environment.
         size: simulations that are placed at once.
         num_threads: native threads that share them.
 
@@ -57,7 +57,7 @@ class PlacedSimulator:
         self.env = body(num_runs=size, num_threads=num_threads, seed=0)
 
     def step(self, observation: Tensor, action: Tensor, design: Tensor) -> Truth:
-        """One step of each row from where it is placed.
+        """Place each row and take one step.
 
         Args:
             observation: ``[N, S]``.
@@ -71,7 +71,7 @@ class PlacedSimulator:
         return Truth(*fields)
 
     def _step(self, observation: Tensor, action: Tensor, design: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As many rows as there are simulations, or fewer: the others repeat the last one."""
+        """Step at most as many rows as there are simulations; spare simulations repeat the last row."""
         count = len(observation)
         rows = torch.arange(self.env.numel(), device=observation.device).clamp(max=count - 1)
         self.env.place(observation[rows], design[rows])

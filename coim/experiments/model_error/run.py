@@ -20,18 +20,18 @@ from coim.experiments.run.settings import Settings
 from coim.experiments.train import train
 from coim.models import select_run
 
-STATES = 3  # of which Fig. 4(b) is drawn, at random
+STATES = 3  # drawn in Fig. 4(b), chosen at random
 
 
 def run(body: type[MorphEnv], name: str, settings: Settings, *, every: int, rows: int) -> Path:
     """Train and measure; leave an ordinary run's folder with two CSV files more.
 
     Args:
-        body: the environment.
-        name: of the environment.
-        settings: of the run; ``resume`` names the folder of one to go on with.
+        body: class of the environment.
+        name: the environment's name.
+        settings: the run's settings; ``resume`` names the folder of a run to go on with.
         every: episodes of a design between two measurements.
-        rows: transitions in each of them.
+        rows: transitions in each measurement.
 
     Returns:
         The folder.
@@ -53,7 +53,7 @@ def run(body: type[MorphEnv], name: str, settings: Settings, *, every: int, rows
 
 
 def to_draw(folder: Path) -> str:
-    """What draws a measured run; figures look for it below a folder of its study.
+    """Name the command that draws a measured run; figures look for it in a folder of its study.
 
     Example:
         >>> to_draw(Path("runs/study-preview/model_error"))
@@ -76,7 +76,7 @@ def probe(
     threads: int = 1,
     side_by_side: bool = False,
 ) -> ProbedCoAdaptation:
-    """Build the run as its recipe does, and put a second model and the probes beside it."""
+    """Build the run as `coim run` does, with a second model and the rows to measure both on."""
     algorithm = build(body, settings, threads=threads, side_by_side=side_by_side)
     learner = other_learner(
         algorithm,
@@ -99,8 +99,8 @@ def probe(
 def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder: Path) -> str:
     """Fig. 4(b)'s numbers from the models as they are at the end; returns what happened in words.
 
-    They are of the first run that has not diverged, and of random states among those through whose design enough of the
-    plane can be built. All is computed on the CPU, where the simulator is, with copies of the models.
+    The first run that has not diverged is drawn, at random states among those through whose design enough of the plane
+    can be built. Everything is computed on the CPU, where the simulator is, with copies of the models.
     """
     if not probed.seen:
         return f"no {FILE}: the run ended before its first measurement"
@@ -125,6 +125,6 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
         rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)
     except ValueError as error:
         return f"no {FILE}: {error}"
-    shown = ({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
-    write_whole(folder / FILE, as_csv(list(rows[0]), shown))
+    written = ({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
+    write_whole(folder / FILE, as_csv(list(rows[0]), written))
     return f"model errors: {probed.path}\ndesign space: {folder / FILE}"

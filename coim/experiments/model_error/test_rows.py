@@ -25,12 +25,12 @@ KEPT = (("observation",), ("design",), ("action",), ("next", "observation"), ("n
 
 
 class Probes:
-    """Collects rows on bodies of its own; nothing of it reaches a replay or a generator of the run that is probed.
+    """Collect rows on bodies of their own; they reach no replay and no generator of the run that is measured.
 
     Args:
-        body: of the environment.
+        body: class of the environment.
         num_runs: K.
-        episode_steps: T, of a trajectory.
+        episode_steps: T, steps of a trajectory.
         num_rows: R, rows kept of each collection.
         num_threads: native threads of the simulations.
         device: where the policies live.
@@ -47,8 +47,10 @@ class Probes:
         device: torch.device | str | None = None,
     ) -> None:
         self.num_rows = num_rows
-        common = {"episode_steps": episode_steps, "num_threads": num_threads, "device": device, "seed": 0}
-        self.env, self.strangers = body(num_runs=num_runs, **common), body(num_runs=NEVER_BUILT, **common)
+        self.env, self.strangers = (
+            body(num_runs=count, episode_steps=episode_steps, num_threads=num_threads, device=device, seed=0)
+            for count in (num_runs, NEVER_BUILT)
+        )
         self.simulator = PlacedSimulator(body, num_threads=num_threads)
         low, high = body.DESIGN_BOUNDS
         uniform = torch.rand(NEVER_BUILT, body.DESIGN_SIZE, generator=torch.Generator().manual_seed(0))
@@ -70,16 +72,16 @@ class Probes:
         return torch.stack(found, 1)
 
     def swapped(self, rows: TensorDictBase, generator: DesignGenerator, *, seed: int) -> tuple[TensorDict, Tensor]:
-        """Stored states under another design, as imagination has them when G is not the identity.
+        """Put stored states under another design, as imagination does when G is not the identity.
 
         Args:
             rows: ``[N, K]``, of which R are drawn.
             generator: G.
-            seed: of the draws.
+            seed: seeds the draws.
 
         Returns:
-            Rows ``[R, K]`` with the next observation that the simulator gives from that state with that body, and which
-            of these states are impossible, ``[R, K]``.
+            Rows ``[R, K]``, with the simulator's next observation of that state and body; and which of these states are
+            impossible, ``[R, K]`` bool.
         """
         rng = torch.Generator(rows["design"].device).manual_seed(seed)
         chosen = self._thinned(rows, rng)
@@ -96,7 +98,7 @@ class Probes:
         return torch.Generator().manual_seed(seed)
 
     def _thinned(self, rows: TensorDictBase, rng: torch.Generator) -> TensorDict:
-        """R of the rows along the first dimension, or all where there are fewer, of what a test needs."""
+        """Draw R of the rows along the first dimension, or all if there are fewer, with the keys that a test needs."""
         chosen = torch.randperm(len(rows), generator=rng, device=rng.device)[: self.num_rows]
         return rows.select(*KEPT)[chosen].clone()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from coim.envs import MorphEnv
 from coim.events import Event
@@ -56,3 +56,6 @@ class Followed(Protocol):
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Go on from that."""
+
+
+FollowedT = TypeVar("FollowedT", bound=Followed)
