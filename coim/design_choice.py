@@ -23,7 +23,6 @@ from coim.designs import DesignSearch, RandomDesigns
 from coim.designs.search import Fitness
 from coim.envs.morph import MorphEnv
 from coim.events import DesignChosen, DesignDone, Kind, Place
-from coim.learners.divergence import flat_fitness
 from coim.learners.sac import SACLearner
 from coim.models.stacked import select_run
 from coim.objectives.design import DesignValue
@@ -152,7 +151,7 @@ class DesignChoice:
         return [
             value(select_run(policy, k), select_run(qvalue, k), states[:, k])
             if k not in situation.diverged
-            else flat_fitness
+            else _flat_fitness
             for k in range(situation.num_runs)
         ]
 
@@ -207,6 +206,11 @@ class DesignChoice:
             return None
         values = [fitness(row.unsqueeze(0))[0] for fitness, row in zip(self.fitness(situation), design)]
         return torch.stack(values).cpu()
+
+
+def _flat_fitness(designs: Tensor) -> Tensor:
+    """Stand in for Eq. 5 of a run that keeps its body; its search draws as many numbers as any, ``[P, D] -> [P]``."""
+    return 0.0 * designs.sum(-1)
 
 
 def _check_first_designs(spec: Bounded, first_designs: Tensor) -> None:

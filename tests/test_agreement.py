@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_coadaptation import STEPS, dealt
+from small_algorithm import STEPS, dealt
 from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import DoubleToFloat, TransformedEnv

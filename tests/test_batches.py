@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from counted_rows import filled, keys_of, make_rows
 from tensordict import TensorDict
-from test_buffers import filled, keys_of, make_rows
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from coim.batches import BatchParts, batch_parts, sample_batches, sample_mixture

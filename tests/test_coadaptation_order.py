@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
+from small_algorithm import STEPS, small
 from tensordict import TensorDict
-from test_coadaptation import STEPS, small
 
 from coim import (
     CoAdaptation,

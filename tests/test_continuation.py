@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_coadaptation import small
+from small_algorithm import small
 
 from coim import CoAdaptation, DesignChosen, DesignDone, EpisodeDone, Event
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_coadaptation import STEPS, small
+from small_algorithm import STEPS, small
 from torch import Tensor
 
 from coim import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_coadaptation import small
+from small_algorithm import small
 from torch import Tensor
 
 from coim import (

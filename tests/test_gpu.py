@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import torch
+from small_algorithm import small
 from tensordict import TensorDict
-from test_coadaptation import small
 from toy_learners import dynamics_learner, sac_learner
 
 from coim import (

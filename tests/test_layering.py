@@ -186,6 +186,14 @@ def test_no_folder_or_module_has_a_name_that_says_nothing() -> None:
     assert refused_names(sources) == []
 
 
+def test_no_test_imports_another() -> None:
+    """What several tests need is a fixture, or a module that is no test."""
+    sources = sorted((ROOT / "tests").rglob("*.py"))
+    found = [name for path in sources for name in imports(ast.parse(path.read_text()), path.stem, is_package=False)]
+    assert "toy_env" in found
+    assert [name for name in found if name.startswith("test_")] == []
+
+
 def test_importing_the_library_is_silent_and_leaves_no_file(tmp_path: Path) -> None:
     modules = [module for _, module in library() if not module.startswith("coim.experiments")]
     script = "\n".join(f"import {module}" for module in modules)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_coadaptation import small
+from small_algorithm import small
 
 from coim import EpisodeDone, HopperMorph, UpdatePlan
 from coim.batches import BatchParts

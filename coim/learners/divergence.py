@@ -110,8 +110,3 @@ class Divergence:
 def _largest(rows: Tensor) -> Tensor:
     """Largest absolute value of each row, ``[K, N] -> [K]``, NaN if the row has one; 20 times faster than its norm."""
     return torch.maximum(rows.amax(1), -rows.amin(1))
-
-
-def flat_fitness(designs: Tensor) -> Tensor:
-    """Stand in for Eq. 5 of a run that needs no body; the search draws as many numbers for it, ``[P, D] -> [P]``."""
-    return 0.0 * designs.sum(-1)

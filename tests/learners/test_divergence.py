@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import torch
+from small_algorithm import STEPS, small
 from tensordict import TensorDict
-from test_coadaptation import STEPS, small
 from torch import Tensor
 
 from coim import CoAdaptation, DesignChosen, DesignDone, EpisodeDone, Event, GradientSearch
