@@ -9,23 +9,23 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import statistics
-from collections import defaultdict
 from pathlib import Path
 from typing import Literal
 
 import matplotlib.pyplot as plt
+import pandas as pd
 import torch
 import tyro
 
 from coim import EpisodeDone, HalfCheetahMorph, run_episode
+from coim.experiments.frames import read_frame
 from coim.experiments.report.summary_png import save
 from coim.experiments.run.atomic_write import telling_full_disk
 from coim.experiments.run.build import build
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import available_cores, checked_device, prepare
 from coim.experiments.run.settings import Settings
-from coim.tables import Layout, read_cells
+from coim.tables import Layout
 
 # Imagined rows in the individual batches too: on a single body the population's networks never act.
 ARMS = {
@@ -34,7 +34,11 @@ ARMS = {
     "model-free in bfloat16": Settings(imagine="none", precision="bfloat16"),
 }
 COLOURS = dict(zip(ARMS, ("#0072B2", "#D55E00", "#009E73")))  # Okabe and Ito
-COLUMNS = ["arm", "seed", "episode", "return"]
+CURVES = Layout(
+    file="curves.csv",
+    columns={"arm": str, "seed": int, "episode": int, "return": float},
+    needed=("arm", "seed", "episode", "return"),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,15 +63,15 @@ class Curve:
 def main(curve: Curve) -> None:
     """Run what is missing, then draw everything."""
     curve.out.mkdir(parents=True, exist_ok=True)
-    path = curve.out / "curves.csv"
+    path = curve.out / CURVES.file
     if not path.exists():
-        write(path, [COLUMNS])
-    done = {(row["arm"], int(row["seed"])) for row in read(path)}
+        write(path, [CURVES.header()])
+    done = {*read(path)[["arm", "seed"]].itertuples(index=False, name=None)}
     for seed in curve.seeds:
         for arm in curve.arms:
             if (arm, seed) not in done:
                 write(path, returns(arm, dataclasses.replace(ARMS[arm], seed=seed), curve.episodes))
-    if not any(row["arm"] == "random policy" for row in read(path)):
+    if not (read(path)["arm"] == "random policy").any():
         write(path, [["random policy", 0, i + 1, value] for i, value in enumerate(random_returns(curve))])
     summarise(curve, read(path))
 
@@ -95,25 +99,22 @@ def random_returns(curve: Curve) -> list[float]:
     return [float(rows["next", "reward"].sum()) for rows in episodes]
 
 
-def summarise(curve: Curve, rows: list[dict[str, str]]) -> None:
+def summarise(curve: Curve, rows: pd.DataFrame) -> None:
     """Draw the curves and write the ratio to the random policy that each arm ends with."""
-    by_arm: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        by_arm[row["arm"]][int(row["seed"])].append(float(row["return"]))
-    random_return = statistics.mean(by_arm.pop("random policy")[0])
+    by_random = rows["arm"] == "random policy"
+    random_return = rows["return"][by_random].mean()
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     table = [
         ["arm", "seeds", "return_last_episode_mean", "return_last_episode_min", "times_random_mean", "times_random_min"]
     ]
-    for arm, seeds in by_arm.items():
-        episodes = range(1, 1 + min(map(len, seeds.values())))
-        for values in seeds.values():
-            axes.plot(episodes, values[: len(episodes)], color=COLOURS[arm], linewidth=0.7, alpha=0.5)
-        mean = [statistics.mean(values[i] for values in seeds.values()) for i in range(len(episodes))]
-        axes.plot(episodes, mean, color=COLOURS[arm], linewidth=2, label=f"{arm} ({len(seeds)} seeds, mean)")
-        last = [values[len(episodes) - 1] for values in seeds.values()]
-        numbers = mean[-1], min(last), mean[-1] / random_return, min(last) / random_return
-        table.append([arm, len(seeds), *(f"{number:.4g}" for number in numbers)])
+    for arm, own in rows[~by_random].groupby("arm", sort=False):
+        returns = own.pivot(index="episode", columns="seed", values="return").dropna()  # as far as all seeds have come
+        axes.plot(returns, color=COLOURS[arm], linewidth=0.7, alpha=0.5)
+        mean, count = returns.mean(axis="columns"), len(returns.columns)
+        axes.plot(mean, color=COLOURS[arm], linewidth=2, label=f"{arm} ({count} seeds, mean)")
+        last = returns.iloc[-1]
+        numbers = last.mean(), last.min(), last.mean() / random_return, last.min() / random_return
+        table.append([arm, count, *(f"{number:.4g}" for number in numbers)])
     axes.axhline(random_return, color="black", linestyle=":", label="random policy")
     axes.axhline(5 * random_return, color="black", linestyle="--", linewidth=0.8, label="5 x random policy")
     axes.set(xlabel="training episodes (1000 steps each)", ylabel="deterministic return (1)")
@@ -125,9 +126,9 @@ def summarise(curve: Curve, rows: list[dict[str, str]]) -> None:
     print(*(",".join(map(str, row)) for row in table), sep="\n")
 
 
-def read(path: Path) -> list[dict[str, str]]:
+def read(path: Path) -> pd.DataFrame:
     """Rows of ``curves.csv``."""
-    return read_cells(path, Layout(needed=tuple(COLUMNS), words=("arm",), counts=("seed", "episode")))
+    return read_frame(path, CURVES)
 
 
 def write(path: Path, rows: list[list]) -> None:

@@ -24,13 +24,15 @@ import torch
 import tyro
 
 from coim import HopperMorph
+from coim.experiments.frames import read_frame, rows_of
 from coim.experiments.run.atomic_write import dated_file
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.results import Table
 from coim.experiments.run.settings import Settings
 from coim.experiments.train import main as main_of_recipe
 from coim.experiments.train import run
-from coim.tables import OF_RUN, read_cells
+from coim.run_folder import DESIGNS, EVALUATIONS, METRICS
+from coim.tables import Layout
 
 SMALL = Settings(
     num_designs=7,
@@ -92,7 +94,7 @@ def main(soak: Soak) -> None:
             different = differences(folder / kind, victim)
             identical += not different
             row = [i + 1, kind, f"{moment:.3f}", f"{seconds[kind]:.3f}", before, not different]
-            table.append([row])
+            table.append([dict(zip(table.columns, row))])
             print(*row, *different[:3], sep="  ", flush=True)
     print(f"{identical} of {soak.kills} identical -> {out}")
 
@@ -163,11 +165,11 @@ def finish(process: BaseProcess) -> None:
 def differences(one: Path, other: Path) -> list[str]:
     """Where two run folders differ: rows of CSV files but for the seconds, policies, what the last checkpoints hold."""
     found = []
-    for name in ("evaluations.csv", "designs.csv", "metrics.csv"):
-        rows = [rows_without_seconds(folder / name) for folder in (one, other)]
-        found += [f"{name} row {i}" for i, (a, b) in enumerate(zip(*rows)) if a != b]
+    for layout in (EVALUATIONS, DESIGNS, METRICS):
+        rows = [rows_without_seconds(folder, layout) for folder in (one, other)]
+        found += [f"{layout.file} row {i}" for i, (a, b) in enumerate(zip(*rows)) if a != b]
         if len(rows[0]) != len(rows[1]):
-            found.append(f"{name}: {len(rows[0])} and {len(rows[1])} rows")
+            found.append(f"{layout.file}: {len(rows[0])} and {len(rows[1])} rows")
     states = {name: [last_state(folder, name) for folder in (one, other)] for name in ("algorithm", "best", "random")}
     policies = [{path.name for path in folder.glob("policies/*")} for folder in (one, other)]
     if policies[0] != policies[1]:
@@ -180,10 +182,11 @@ def differences(one: Path, other: Path) -> list[str]:
     return found
 
 
-def rows_without_seconds(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file but for what the clock says."""
-    rows = read_cells(path, OF_RUN[path.name])
-    return [{key: value for key, value in row.items() if not key.startswith("seconds")} for row in rows]
+def rows_without_seconds(folder: Path, layout: Layout) -> list[dict[str, Any]]:
+    """Rows of a CSV file but for what the clock says; None for a missing number, so that equal rows are equal."""
+    rows = read_frame(folder / layout.file, layout)
+    kept = rows[[name for name in rows.columns if not name.startswith("seconds")]].astype("object")
+    return rows_of(kept.where(kept.notna(), None))
 
 
 def last_state(folder: Path, component: str) -> Path:

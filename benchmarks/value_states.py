@@ -23,6 +23,7 @@ from benchmarks.networks import load
 from coim import DesignValue, MorphEnv, Policy, run_episode
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import prepare
+from coim.run_folder import read_designs
 
 CELLS = Path(__file__).parents[1] / "docs/results/preview/cells"
 
@@ -70,12 +71,8 @@ def main(asked: Asked) -> None:
 
 def tried_bodies() -> tuple[Tensor, Tensor]:
     """Designs ``[300, 4]`` of the preview study's Hopper runs and the best return on each."""
-    designs, returns = [], []
-    for path in sorted(CELLS.glob("hopper-*/designs.csv")):
-        for row in csv.DictReader(path.read_text().splitlines()):
-            designs.append([float(cell) for name, cell in row.items() if name.startswith("xi_")])
-            returns.append(float(row["best_return"]))
-    return torch.tensor(designs), torch.tensor(returns)
+    tried = [design for path in sorted(CELLS.glob("hopper-*")) for design in read_designs(path)]
+    return torch.stack([design.design for design in tried]), torch.tensor([design.best_return for design in tried])
 
 
 def visited(env: MorphEnv, policy: Policy, starts: TensorDict, steps: int) -> TensorDict:

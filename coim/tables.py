@@ -1,7 +1,7 @@
-"""The CSV files of runs and studies, read back; every cell is checked.
+"""Read the CSV files of runs and studies; every cell is checked.
 
 A file that a spreadsheet has saved again, or that somebody has edited, is read if it means the same, and refused by the
-line that does not. Nothing is guessed, and no row that is whole is left out.
+line that does not. Nothing is guessed, and no whole row is left out.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,29 +21,56 @@ Cell = str | int | float
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What the columns of a CSV file hold: numbers or nothing, but for those that are named here and the design's.
+    """A CSV file: its name, its columns and their types.
 
     Attributes:
-        needed: columns without which it is another file.
-        words: columns of text.
-        counts: columns of whole numbers.
+        file: its name in the folder.
+        columns: type of each column, in the order in which they are written. `DESIGN_PREFIX` stands for all columns of
+            the design, which hold finite numbers. A number may be missing, as an empty cell. Columns that are not named
+            here hold numbers.
+        needed: columns without which it is another file: all whole numbers, and what older versions have written. Any
+            other column that is missing is read as if its cells were empty.
         grows: whether rows are appended, so that the last line may be one that is still being written.
     """
 
+    file: str
+    columns: Mapping[str, type[str] | type[int] | type[float]]
     needed: tuple[str, ...]
-    words: tuple[str, ...] = ()
-    counts: tuple[str, ...] = ()
     grows: bool = True
 
+    def header(self, designs: Sequence[str] = (), measured: Sequence[str] = ()) -> list[str]:
+        """Names of the columns of a new file.
+
+        Args:
+            designs: names of the entries of a design.
+            measured: columns of numbers that the layout does not name; they come before ``diverged``, the last one.
+
+        Example:
+            >>> columns = {"run": int, "xi_": float, "diverged": str}
+            >>> Layout(file="a.csv", columns=columns, needed=("run",)).header(["torso"], ["loss"])
+            ['run', 'xi_torso', 'loss', 'diverged']
+        """
+        names: list[str] = []
+        for name in self.columns:
+            if name == "diverged":
+                names += measured
+            names += design_columns(designs) if name == DESIGN_PREFIX else [name]
+        return names
+
+    def type_of(self, column: str) -> type[str] | type[int] | type[float]:
+        """Type of the cells of a column."""
+        return self.columns.get(column, float)
+
     def value(self, column: str, cell: str) -> Cell:
-        """What a cell holds; NaN for an empty one that may be empty.
+        """The value of a cell; NaN for an empty cell of a number.
 
         Raises:
             ValueError: with what is expected, if it is something else.
         """
-        if column in self.words:
+        kind = self.type_of(column)
+        if kind is str:
             return cell
-        if column in self.counts:
+        if kind is int:
             return _number(int, cell, "a whole number")
         if column.startswith(DESIGN_PREFIX):
             if not math.isfinite(value := _number(float, cell, "a number")):
@@ -52,16 +79,8 @@ class Layout:
         return _number(float, cell, "a number or nothing") if cell else math.nan
 
 
-WORDS, COUNTS = ("kind", "diverged"), ("run", "design", "episode", "env_steps")
-OF_RUN = {  # files of a run's folder
-    "evaluations.csv": Layout(needed=("run", "design", "kind", "episode", "return"), words=WORDS, counts=COUNTS),
-    "designs.csv": Layout(needed=("run", "design", "kind", "predicted", "best_return"), words=WORDS, counts=COUNTS),
-    "metrics.csv": Layout(needed=("run", "design", "episode"), words=WORDS, counts=COUNTS),
-}
-
-
-def design_columns(names: Sequence[str]) -> list[str]:
-    """Columns of a design in a CSV file; readers know them by how they begin, in older folders by ``xi_1, xi_2, ...``.
+def design_columns(names: Iterable[str]) -> list[str]:
+    """Columns of a design in a CSV file; readers know them by their prefix, in older folders ``xi_1, xi_2, ...``.
 
     Example:
         >>> design_columns(["torso", "right thigh"])
@@ -71,7 +90,7 @@ def design_columns(names: Sequence[str]) -> list[str]:
 
 
 def entry_of_column(column: str) -> str | None:
-    """The name of an entry of the design from its column; None of other columns, and where older folders count.
+    """The name of an entry of the design from its column; None for other columns, and where older folders count.
 
     Example:
         >>> entry_of_column("xi_right_thigh"), entry_of_column("xi_2"), entry_of_column("run")
@@ -89,56 +108,55 @@ def same_columns(found: Sequence[str], wanted: Sequence[str]) -> bool:
     )
 
 
-def read_table(path: Path, layout: Layout) -> list[dict[str, Cell]]:
-    """Rows of a CSV file, numbers as numbers.
+def read_table(path: Path, layout: Layout) -> dict[str, list[Cell]]:
+    """Read a CSV file.
 
     Args:
-        path: of the file; one that is not there has no rows.
-        layout: of its columns.
+        path: of the file; one that does not exist is read as an empty one.
+        layout: of the file.
+
+    Returns:
+        The cells of each column. Columns of the layout that the file does not have come last.
 
     Raises:
         ValueError: if it is not such a file in UTF-8, with commas between cells and points in numbers; with the line,
             what was found and what was expected.
     """
-    return [{column: value for column, (_, value) in row.items()} for row in _rows(path, layout)]
-
-
-def read_cells(path: Path, layout: Layout) -> list[dict[str, str]]:
-    """Rows of a CSV file as they are written, each cell of which is what it must be; see `read_table`."""
-    return [{column: cell for column, (cell, _) in row.items()} for row in _rows(path, layout)]
+    columns = read_columns(path)
+    if columns and not {*layout.needed} <= {*columns}:
+        raise refusal(path, 1, ",".join(columns), f"columns {','.join(layout.needed)}")
+    table: dict[str, list[Cell]] = {name: [] for name in columns}
+    count = 0
+    for line, cells in _rows(path, len(columns), grows=layout.grows):
+        count += 1
+        for column, cell in zip(columns, cells):
+            try:
+                table[column].append(layout.value(column, cell))
+            except ValueError as error:
+                raise refusal(path, line, f"{cell[:SHOWN]!r} in column {column}", str(error)) from None
+    for name in layout.columns:
+        if name not in (*columns, DESIGN_PREFIX):
+            table[name] = [layout.value(name, "")] * count if count else []
+    return table
 
 
 def read_columns(path: Path) -> list[str]:
-    """Names of the columns of a CSV file; none where it is not there or empty."""
+    """Names of the columns of a CSV file; none where it does not exist or is empty."""
     return next(csv.reader(_lines(path, grows=True)), [])
 
 
-def _rows(path: Path, layout: Layout) -> Iterator[dict[str, tuple[str, Cell]]]:
-    """Each row, with each cell as it is written and what it holds."""
-    reader = csv.reader(_lines(path, grows=layout.grows), strict=True)
+def _rows(path: Path, size: int, *, grows: bool) -> Iterator[tuple[int, list[str]]]:
+    """Each row with the number of its line; pandas would fill short rows up and cut long ones without a word."""
+    reader = csv.reader(_lines(path, grows=grows), strict=True)
     try:
-        columns = next(reader, None)
-        if columns is None:
-            return
-        if not {*layout.needed} <= {*columns}:
-            raise refusal(path, 1, ",".join(columns), f"columns {','.join(layout.needed)}")
+        next(reader, None)
         for cells in reader:
-            if cells:  # spreadsheets end files with empty lines
-                yield _row(path, reader.line_num, columns, cells, layout)
+            if len(cells) not in (0, size):  # spreadsheets end files with empty lines
+                raise refusal(path, reader.line_num, f"{len(cells)} cells", f"{size} as in line 1")
+            if cells:
+                yield reader.line_num, cells
     except csv.Error as error:
-        raise refusal(path, reader.line_num, str(error), f"{len(columns or ())} cells") from None
-
-
-def _row(path: Path, line: int, columns: list[str], cells: list[str], layout: Layout) -> dict[str, tuple[str, Cell]]:
-    if len(cells) != len(columns):
-        raise refusal(path, line, f"{len(cells)} cells", f"{len(columns)} as in line 1")
-    row = {}
-    for column, cell in zip(columns, cells):
-        try:
-            row[column] = cell, layout.value(column, cell)
-        except ValueError as error:
-            raise refusal(path, line, f"{cell[:SHOWN]!r} in column {column}", str(error)) from None
-    return row
+        raise refusal(path, reader.line_num, str(error), f"{size} cells") from None
 
 
 def _lines(path: Path, *, grows: bool) -> list[str]:

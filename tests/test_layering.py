@@ -25,7 +25,7 @@ RANKS |= {name: 2 for name in ("governor", "imagined_replay")}
 RANKS |= {"experiments": 3}
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
 HOMES |= {name: "designs" for name in ("botorch", "gpytorch", "linear_operator")}
-HOMES |= {name: "experiments" for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray")}
+HOMES |= {name: "experiments" for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray", "pandas")}
 REFUSED = {"utils", "common", "core", "helpers", "misc", "trainers"}
 DYNAMIC_IMPORTS = {"importlib.import_module", "import_module", "__import__"}
 FUNCTIONAL_MAY_IMPORT = {"torch", "__future__", "typing", "math"}
@@ -197,7 +197,7 @@ def test_no_test_imports_another() -> None:
 def test_importing_the_library_is_silent_and_leaves_no_file(tmp_path: Path) -> None:
     modules = [module for _, module in library() if not module.startswith("coim.experiments")]
     script = "\n".join(f"import {module}" for module in modules)
-    script += "\nimport sys; assert not {'matplotlib', 'wandb', 'tyro', 'imageio'} & set(sys.modules)"
+    script += "\nimport sys; assert not {'matplotlib', 'wandb', 'tyro', 'imageio', 'pandas'} & set(sys.modules)"
     script += "\nimport logging; assert not logging.root.handlers"
     result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
@@ -227,6 +227,7 @@ def test_importing_the_library_is_silent_and_leaves_no_file(tmp_path: Path) -> N
         ("coim.envs.hopper", "import pyswarms", "imports pyswarms, whose home is designs"),
         ("coim.coadaptation", "import wandb", "imports wandb, whose home is experiments"),
         ("coim.coadaptation", "import tyro", "imports tyro, whose home is experiments"),
+        ("coim.saved_run", "def rows():\n    import pandas", "imports pandas, whose home is experiments"),
         ("coim.envs.morph", "import matplotlib.pyplot as plt", "imports matplotlib, whose home is experiments"),
         ("coim", "from argparse import ArgumentParser", "imports argparse, whose home is experiments"),
         ("coim.objectives.functional", "import numpy as np", "it may import torch only"),

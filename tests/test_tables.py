@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import math
 from pathlib import Path
 
 import pytest
 
-from coim.tables import Layout, read_cells, read_columns, read_table
+from coim.tables import Layout, read_columns, read_table
 
-LAYOUT = Layout(needed=("run", "kind", "return"), words=("kind",), counts=("run",))
+LAYOUT = Layout(
+    file="table.csv",
+    columns={"run": int, "kind": str, "xi_": float, "return": float, "seconds": float, "diverged": str},
+    needed=("run", "kind", "return"),
+)
 TEXT = "run,kind,xi_torso,return\n0,first,0.5,1.25\n1,random,2,\n"
-ROWS = [
-    {"run": 0, "kind": "first", "xi_torso": 0.5, "return": 1.25},
-    {"run": 1, "kind": "random", "xi_torso": 2.0, "return": math.nan},
-]
+TABLE = {
+    "run": [0, 1],
+    "kind": ["first", "random"],
+    "xi_torso": [0.5, 2.0],
+    "return": [1.25, math.nan],
+    "seconds": [math.nan, math.nan],  # which the file does not have
+    "diverged": ["", ""],
+}
 ROOT = Path(__file__).parents[1]
 
 
@@ -41,16 +50,15 @@ def written(folder: Path, contents: str | bytes) -> Path:
 )
 def test_what_means_the_same_is_read_the_same(tmp_path: Path, contents: str) -> None:
     path = written(tmp_path, contents)
-    rows = read_table(path, LAYOUT)
-    assert str(rows) == str(ROWS)  # NaN is not equal to itself
-    assert [row["return"] for row in read_cells(path, LAYOUT)] == ["1.25", ""]
+    assert str(read_table(path, LAYOUT)) == str(TABLE)  # NaN is not equal to itself
     assert read_columns(path) == ["run", "kind", "xi_torso", "return"]
 
 
 @pytest.mark.parametrize("contents", ["", "run,kind,xi_torso,return\n", "run,ki"])
 def test_a_file_that_is_not_there_or_empty_has_no_rows(tmp_path: Path, contents: str) -> None:
-    assert read_table(tmp_path / "none.csv", LAYOUT) == []
-    assert read_table(written(tmp_path, contents), LAYOUT) == []
+    for table in (read_table(tmp_path / "none.csv", LAYOUT), read_table(written(tmp_path, contents), LAYOUT)):
+        assert {"run", "kind", "return", "seconds", "diverged"} <= table.keys()
+        assert not any(table.values())
 
 
 @pytest.mark.parametrize(
@@ -76,18 +84,22 @@ def test_what_does_not_is_refused_by_its_line(
     tmp_path: Path, contents: str | bytes, line: int, found: str, expected: str
 ) -> None:
     path = written(tmp_path, contents)
-    for read in (read_table, read_cells):
-        with pytest.raises(ValueError, match="put the file back from a copy, or save it again in UTF-8") as refusal:
-            read(path, LAYOUT)
-        assert str(refusal.value).startswith(f"{path}, line {line}: found {found}, expected {expected}; ")
-        assert "\n" not in str(refusal.value)
+    with pytest.raises(ValueError, match="put the file back from a copy, or save it again in UTF-8") as refusal:
+        read_table(path, LAYOUT)
+    assert str(refusal.value).startswith(f"{path}, line {line}: found {found}, expected {expected}; ")
+    assert "\n" not in str(refusal.value)
 
 
 def test_of_a_file_that_does_not_grow_the_last_line_counts_without_its_end(tmp_path: Path) -> None:
-    whole = Layout(needed=LAYOUT.needed, words=LAYOUT.words, counts=LAYOUT.counts, grows=False)
     path = written(tmp_path, TEXT.removesuffix("\n"))
-    assert len(read_table(path, LAYOUT)) == 1
-    assert str(read_table(path, whole)) == str(ROWS)
+    assert read_table(path, LAYOUT)["run"] == [0]
+    assert str(read_table(path, dataclasses.replace(LAYOUT, grows=False))) == str(TABLE)
+
+
+def test_a_float_is_read_as_it_was_written(tmp_path: Path) -> None:
+    values = [0.1 + 0.2, 1e-320, math.nextafter(1.0, 2.0), 123456789.123456789]
+    path = written(tmp_path, TEXT.splitlines()[0] + "\n" + "".join(f"0,first,1,{value!r}\n" for value in values))
+    assert read_table(path, LAYOUT)["return"] == values
 
 
 def test_nothing_else_reads_csv_files() -> None:
@@ -96,6 +108,6 @@ def test_nothing_else_reads_csv_files() -> None:
         path.relative_to(ROOT).as_posix()
         for path in sources
         for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Attribute) and ast.unparse(node) in ("csv.reader", "csv.DictReader")
+        if isinstance(node, ast.Attribute) and ast.unparse(node) in ("csv.reader", "csv.DictReader", "pd.read_csv")
     ]
     assert {*calls} == {"coim/tables.py"}

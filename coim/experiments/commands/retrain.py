@@ -19,12 +19,13 @@ from collections.abc import Sequence
 
 import tyro
 
+from coim.experiments.frames import rows_of
 from coim.experiments.run.interrupt import locked, on_command_line, stopping_at_once
 from coim.experiments.run.machine import available_cores
 from coim.experiments.study.cluster import ray_running, without_words_of_ray
 from coim.experiments.study.ray_scheduler import Conductor, Resources, refuse_lack, take_up
 from coim.experiments.study.retraining import Retrain, Retraining, cell_of, choose
-from coim.experiments.study.runs import read_runs
+from coim.experiments.study.runs import CHOSEN, read_runs
 
 DEFAULT = ", as the study gave to a first design (the paper: 300); --episodes takes another number"
 
@@ -53,7 +54,8 @@ def retrain(asked: Retrain) -> list[str]:
     folder = asked.study / "retrained"
     runs = read_runs(asked.study)
     with locked(folder):
-        cells = [cell_of(line, asked) for line in choose(runs, folder / "designs.csv", asked)]
+        chosen = choose(runs, folder / CHOSEN.file, asked)
+        cells = [cell_of(line, asked) for line in rows_of(chosen)]
         resources = Resources(gpus=asked.gpus)
         try:
             ledger = take_up(folder, cells, resources)

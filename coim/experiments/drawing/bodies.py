@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,24 +13,25 @@ from tensordict import TensorDict
 
 from coim.envs import MorphEnv
 from coim.experiments.drawing.palette import KINDS, kind_handles, put_legend
-from coim.experiments.run.records import Row, number
+from coim.experiments.frames import designs_of, rows_of
+from coim.experiments.run.records import number
 
 GAP = 0.3  # m between two bodies
 BODIES_IN_A_LINE = 8
 
 
-def draw_bodies(axes: Axes, rows: Sequence[Row], body: type[MorphEnv]) -> None:
+def draw_bodies(axes: Axes, rows: pd.DataFrame, body: type[MorphEnv]) -> None:
     """Draw designs from left to right on one floor, each above its number and its best return.
 
     Args:
         axes: to draw on.
-        rows: designs, at least one.
-        body: what the designs belong to.
+        rows: of `coim.experiments.run.records.Record.designs`, at least one.
+        body: the environment that the designs belong to.
     """
     env = body(num_runs=len(rows), reset_noise=0, seed=0)
-    env.reset(TensorDict({"design": torch.tensor([row["xi"] for row in rows])}, [len(rows)]))
+    env.reset(TensorDict({"design": torch.tensor(designs_of(rows), dtype=torch.float32)}, [len(rows)]))
     left = 0.0
-    for run, row in enumerate(rows):
+    for run, row in enumerate(rows_of(rows)):
         capsules = env.capsules(run).numpy()
         x, radius = capsules[:, [0, 2]], capsules[:, 4:]
         shift = left - float((x - radius).min())
@@ -46,7 +48,7 @@ def draw_bodies(axes: Axes, rows: Sequence[Row], body: type[MorphEnv]) -> None:
     axes.spines[["top", "right", "bottom"]].set_visible(False)
 
 
-def draw_lines_of_bodies(lines: Sequence[tuple[str, Sequence[Row]]], body: type[MorphEnv]) -> Figure:
+def draw_lines_of_bodies(lines: Sequence[tuple[str, pd.DataFrame]], body: type[MorphEnv]) -> Figure:
     """Several lines of bodies under each other, all to one scale.
 
     Args:
@@ -58,7 +60,7 @@ def draw_lines_of_bodies(lines: Sequence[tuple[str, Sequence[Row]]], body: type[
     for axes, (title, rows) in zip(grid, lines):
         draw_bodies(axes, rows, body)
         axes.set_title(title, loc="left")
-    put_legend(figure, kind_handles(row["kind"] for _, rows in lines for row in rows))
+    put_legend(figure, kind_handles(kind for _, rows in lines for kind in rows["kind"]))
     right, top = (max(getattr(axes, name)()[1] for axes in grid) for name in ("get_xlim", "get_ylim"))
     for axes in grid:
         axes.set(xlim=(-GAP, right), ylim=(-0.05, top), anchor="W")

@@ -57,7 +57,7 @@ def families(there: Sequence[str]) -> dict[str, list[str]]:
 
 def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
     """One figure, a panel for each environment, task and statistic."""
-    drawn = [arm for arm in arms if any(run.designs for run in runs.found if run.arm == arm)]
+    drawn = [arm for arm in arms if any(len(run.designs) for run in runs.found if run.arm == arm)]
     if not drawn:
         return missing(name, f"No run of {' or '.join(arms) or 'its arms'} has finished a design yet.")
     panels = arranged([place for place in runs.places if {*arms} & {*runs.arms_at(place)}])
@@ -100,7 +100,7 @@ def draw_panel(
     environment, task = place
     failure = runs.failure(place)
     for arm in arms:
-        own = [run for run in runs.of(place, arm) if run.designs or (run.diverged and math.isfinite(failure))]
+        own = [run for run in runs.of(place, arm) if len(run.designs) or (run.diverged and math.isfinite(failure))]
         if not own:
             continue
         longest = max(run.num_designs for run in own)
@@ -145,9 +145,9 @@ def best_returns(own: Sequence[Run], longest: int, failure: float) -> np.ndarray
 
 def draw_run(axes: Axes, run: Run) -> None:
     """A faint line through what the run reached, with a cross where it diverged."""
-    if not run.designs:
+    if run.designs.empty:
         return
-    x, y = zip(*sorted((row["design"], row["best_return"]) for row in run.designs))
+    x, y = (run.designs[name].to_numpy() for name in ("design", "best_return"))
     colour = arm_named(run.arm).colour
     axes.plot(x, y, color=colour, linewidth=0.6, alpha=0.25, zorder=1)
     if run.diverged:
@@ -156,10 +156,10 @@ def draw_run(axes: Axes, run: Run) -> None:
 
 def rows_of(run: Run) -> list[dict[str, object]]:
     """The line of a single run."""
-    head = {"environment": run.environment, "task": run.task, "arm": run.arm, "series": "run"}
+    head: dict[str, object] = {"environment": run.environment, "task": run.task, "arm": run.arm, "series": "run"}
     head |= {"seed": run.seed, "run": run.number}
     last = {"low": "", "high": "", "runs": 1}
     return [
-        head | {"design": row["design"], "best_return": row["best_return"]} | last
-        for row in sorted(run.designs, key=lambda row: row["design"])
+        head | {"design": design, "best_return": best} | last
+        for design, best in run.designs[["design", "best_return"]].itertuples(index=False, name=None)
     ]

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm
@@ -21,10 +22,9 @@ from matplotlib.patheffects import withStroke
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import CIRCLE, put_legend
 from coim.experiments.figures.figure import Plot, missing
-from coim.experiments.model_error.design_space import FILE, LAYOUT
-from coim.experiments.model_error.tables import FOLDER, Kind, Row, folders_with, name_of
+from coim.experiments.frames import read_frame, rows_of
+from coim.experiments.model_error.tables import CHANGES, FOLDER, Kind, folders_with, name_of
 from coim.pairs import IN_THE_FLOOR
-from coim.tables import read_cells
 
 SOURCES = {"delta": "model of changes", "next": "model of next states", "simulator": "simulator"}
 STEM = "figure_4b_design_space"
@@ -33,23 +33,30 @@ SHOWN = (1e-3, 1e2)  # variances of one-step changes; beyond, colours end
 
 def plots(study: Path) -> Iterator[Plot]:
     """A row of panels for each state: two models and the simulator; of each kind of run its first folder by name."""
-    found = folders_with(study, FILE)
+    found = folders_with(study, CHANGES.file)
     if not found:
         line = f"coim model-error ENVIRONMENT --out {study / FOLDER}"
         yield missing(STEM, f"No model was looked into at the end of its run: {line}")
     for kind, (folder, *others) in found.items():
-        name, rows = name_of(STEM, kind, found), read_cells(folder / FILE, LAYOUT)
+        name, rows = name_of(STEM, kind, found), read_frame(folder / CHANGES.file, CHANGES)
         notes = (*notes_on(rows), told_of(folder, others, study))
-        yield Plot(name=name, figure=drawn(rows), rows=rows, caption=caption(kind), notes=notes, table=medians(rows))
+        yield Plot(
+            name=name,
+            figure=drawn(rows),
+            rows=rows_of(rows),
+            caption=caption(kind),
+            notes=notes,
+            table=medians(rows),
+        )
 
 
-def drawn(rows: Sequence[Row]) -> Figure:
+def drawn(rows: pd.DataFrame) -> Figure:
     """A line of panels for each state, a column for each source."""
-    states = sorted({int(row["state"]) for row in rows})
+    states = sorted({*rows["state"]})
     figure, grid = new_figure(1.0 + 1.7 * len(states), len(states), len(SOURCES))
     panels = iter(grid)
     for state in states:
-        own = [row for row in rows if int(row["state"]) == state]
+        own = rows[rows["state"] == state]
         line = [next(panels) for _ in SOURCES]
         for axes, (source, title) in zip(line, SOURCES.items()):
             mesh = draw(axes, own, source)
@@ -63,23 +70,23 @@ def drawn(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def draw(axes: Axes, rows: Sequence[Row], source: str) -> QuadMesh:
+def draw(axes: Axes, rows: pd.DataFrame, source: str) -> QuadMesh:
     """One state and one source: colours over the plane, hatched where the state is impossible."""
-    grid = [row for row in rows if row["point"] == "grid"]
-    x, y = (np.unique([float(row[key]) for row in grid]) for key in ("pc_1", "pc_2"))
-    shape = (len(y), len(x))
-    change, depth = np.full(shape, np.nan), np.full(shape, np.nan)
-    for row in grid:
-        at = np.searchsorted(y, float(row["pc_2"])), np.searchsorted(x, float(row["pc_1"]))
-        change[at], depth[at] = float(row[f"normalised/{source}"]), float(row["depth"])
+    grid = rows[rows["point"] == "grid"]
+    change, depth = (
+        grid.pivot(index="pc_2", columns="pc_1", values=name) for name in (f"normalised/{source}", "depth")
+    )
+    x, y = change.columns.to_numpy(), change.index.to_numpy()
     norm = LogNorm(*SHOWN, clip=True)
     mesh = axes.pcolormesh(x, y, change, norm=norm, cmap="cividis", shading="nearest", rasterized=True)
-    if (depth > IN_THE_FLOOR).any():
+    if (depth > IN_THE_FLOOR).any(axis=None):
         axes.contourf(x, y, depth, levels=[IN_THE_FLOOR, np.inf], colors="none", hatches=["////"])
         axes.contour(x, y, depth, levels=[IN_THE_FLOOR], colors="white", linewidths=0.8)
-    tried = [(float(row["pc_1"]), float(row["pc_2"])) for row in rows if row["point"] == "tried"]
+    tried = rows[rows["point"] == "tried"]
     around = [withStroke(linewidth=2, foreground="grey")]  # a cross may lie beyond the plane's bounds, on white
-    axes.plot(*zip(*tried), "x", color="white", markersize=3.5, markeredgewidth=0.8, path_effects=around)
+    axes.plot(
+        tried["pc_1"], tried["pc_2"], "x", color="white", markersize=3.5, markeredgewidth=0.8, path_effects=around
+    )
     axes.plot(0, 0, "o", clip_on=False, **CIRCLE)
     axes.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     return mesh
@@ -103,9 +110,9 @@ def caption(kind: Kind) -> str:
     )
 
 
-def notes_on(rows: Sequence[Row]) -> list[str]:
+def notes_on(rows: pd.DataFrame) -> list[str]:
     """How states and planes were chosen."""
-    shares = " and ".join(f"{float(rows[0][key]):.0%}" for key in ("share_1", "share_2"))
+    shares = " and ".join(f"{rows[key].iloc[0]:.0%}" for key in ("share_1", "share_2"))
     return [
         "States and actions are drawn at random among those whose plane has an area within the bounds.",
         f"The two components are in scale factors and hold {shares} of the variance of the designs tried.",
@@ -114,17 +121,14 @@ def notes_on(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def medians(rows: Sequence[Row]) -> list[dict[str, object]]:
+def medians(rows: pd.DataFrame) -> list[dict[str, object]]:
     """Median change by each source, where the state is possible and where it is not."""
-    grid = [row for row in rows if row["point"] == "grid"]
-    deep = np.array([float(row["depth"]) > IN_THE_FLOOR for row in grid])
-    change = {
-        title: np.array([float(row[f"normalised/{source}"]) for row in grid]) for source, title in SOURCES.items()
-    }
+    grid = rows[rows["point"] == "grid"]
+    deep = grid["depth"] > IN_THE_FLOOR
     return [
-        {"state": words} | {title: float(np.nanmedian(values[chosen])) for title, values in change.items()}
-        for words, chosen in (("possible", ~deep), ("impossible", deep))
-        if chosen.any()
+        {"state": words} | {title: float(chosen[f"normalised/{source}"].median()) for source, title in SOURCES.items()}
+        for words, chosen in (("possible", grid[~deep]), ("impossible", grid[deep]))
+        if len(chosen)
     ]
 
 

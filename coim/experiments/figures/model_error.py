@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -18,25 +19,24 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, put_legend
 from coim.experiments.figures.figure import Plot, missing
-from coim.experiments.model_error.algorithm import FILE, LAYOUT
+from coim.experiments.frames import read_frame, rows_of
 from coim.experiments.model_error.tables import (
+    ERRORS,
     FOLDER,
     LAST,
     Kind,
-    curves,
     differences,
+    errors,
     first_late_step,
     folders_with,
     late_share,
+    mean_error,
     name_of,
     with_shares,
 )
 from coim.experiments.report.curves import STEPS
 from coim.experiments.statistics.intervals import RESAMPLES
 from coim.run_folder import read_config
-from coim.tables import read_cells
-
-Rows = Sequence[dict[str, object]]
 
 # Colour, dashes, mark and words of each thing that is measured.
 PROBES = {
@@ -59,15 +59,16 @@ STEM = "figure_4a_model_error"
 
 def plots(study: Path) -> Iterator[Plot]:
     """Error over training for each kind of run that was measured, a panel for each model and each unit."""
-    found = folders_with(study, FILE)
+    found = folders_with(study, ERRORS.file)
     if not found:
         line = f"coim model-error ENVIRONMENT --out {study / FOLDER}"
         yield missing(STEM, f"No model error was measured: {line}")
     for kind, folders in found.items():
         name = name_of(STEM, kind, found)
-        rows = [row for folder in folders for row in rows_of(folder, study)]
-        if not rows:
-            yield missing(name, f"There is no measurement yet in {' and '.join(str(x / FILE) for x in folders)}.")
+        rows = pd.concat([measured_in(folder, study) for folder in folders], ignore_index=True)
+        if rows.empty:
+            files = " and ".join(str(folder / ERRORS.file) for folder in folders)
+            yield missing(name, f"There is no measurement yet in {files}.")
             continue
         yield Plot(
             name=name,
@@ -79,13 +80,13 @@ def plots(study: Path) -> Iterator[Plot]:
         )
 
 
-def rows_of(folder: Path, study: Path) -> list[dict[str, object]]:
+def measured_in(folder: Path, study: Path) -> pd.DataFrame:
     """What was measured in a folder, with its name and its seed."""
     seed = read_config(folder)["settings"].get("seed", 0)
-    return with_shares(read_cells(folder / FILE, LAYOUT), folder.relative_to(study).as_posix(), seed)
+    return with_shares(read_frame(folder / ERRORS.file, ERRORS), folder.relative_to(study).as_posix(), seed)
 
 
-def drawn(rows: Rows) -> Figure:
+def drawn(rows: pd.DataFrame) -> Figure:
     """A line of panels for each unit, a column for each model."""
     figure, grid = new_figure(6.4, len(UNITS), len(MODELS), sharex=True)
     panels = iter(grid)
@@ -100,23 +101,23 @@ def drawn(rows: Rows) -> Figure:
         pair[0].set(ylabel=words)
     for axes in grid[-len(MODELS) :]:
         axes.set(xlabel=STEPS)
-    put_legend(figure, list(handles({str(row["probe"]) for row in rows})))
+    put_legend(figure, list(handles({*rows["probe"]})))
     return figure
 
 
-def draw(axes: Axes, rows: Rows, model: str, unit: str) -> None:
+def draw(axes: Axes, rows: pd.DataFrame, model: str, unit: str) -> None:
     """One model in one unit: for each probe the mean over runs, with its interval and the runs where there are several.
 
     The mean's line has the probe's name as its label.
     """
     for probe, (colour, dashes, mark, _) in PROBES.items():
-        found = curves(rows, probe, model, unit)
+        found = errors(rows, probe, model, unit)
         style = {"color": colour, "linestyle": dashes or "none"}
-        for run in found.runs if len(found.runs) > 1 else ():
+        for run in found.y if len(found.y) > 1 else ():
             there = np.isfinite(run)
             faint = style | {"marker": mark, "markersize": 2.5, "linewidth": 0.6, "alpha": 0.25, "zorder": 1}
-            axes.plot(found.steps[there], run[there], label=f"_{probe}", **faint)
-        x, value, low, high, _ = found.mean()
+            axes.plot(found.x[there], run[there], label=f"_{probe}", **faint)
+        x, value, low, high, _ = mean_error(rows, probe, model, unit)
         lone = mark or ("o" if len(x) == 1 else "")
         axes.plot(x, value, label=probe, marker=lone, markersize=4, linewidth=1.3, zorder=3, **style)
         if mark:
@@ -141,18 +142,18 @@ def handles(measured: set[str]) -> Iterator[Line2D]:
     yield Line2D([], [], color=GREY, linestyle="--", linewidth=1, label="predicting no change")
 
 
-def behind(rows: Rows) -> list[dict[str, object]]:
+def behind(rows: pd.DataFrame) -> list[dict[str, object]]:
     """The CSV file: the rows of every run, and where there are several the mean and its interval at each step."""
     ends = [f"{unit}_{end}" for unit in UNITS for end in ("low", "high")]
-    nothing = dict.fromkeys([*rows[0], *ends], "")
-    found = [{"series": "run", **nothing, **row, "runs": 1} for row in rows]
+    nothing = dict.fromkeys([*rows.columns, *ends], "")
+    found = [{"series": "run", **nothing, **row, "runs": 1} for row in rows_of(rows)]
     if len(names_of(rows)) == 1:
         return found
     for probe in PROBES:
         for model in MODELS:
             means: dict[int, dict[str, object]] = {}
             for unit in UNITS:
-                for step, value, low, high, count in zip(*curves(rows, probe, model, unit).mean()):
+                for step, value, low, high, count in zip(*mean_error(rows, probe, model, unit)):
                     numbers = {unit: value, f"{unit}_low": low, f"{unit}_high": high, "runs": int(count)}
                     means.setdefault(int(step), {}).update(numbers)
             head = {"series": "mean", **nothing, "probe": probe, "predict": model}
@@ -160,12 +161,12 @@ def behind(rows: Rows) -> list[dict[str, object]]:
     return found
 
 
-def names_of(rows: Rows) -> set[tuple[object, object]]:
+def names_of(rows: pd.DataFrame) -> set[tuple[object, object]]:
     """Folder and number of each run."""
-    return {(row["folder"], row["run"]) for row in rows}
+    return {*rows[["folder", "run"]].itertuples(index=False, name=None)}
 
 
-def caption(kind: Kind, rows: Rows) -> str:
+def caption(kind: Kind, rows: pd.DataFrame) -> str:
     """What is drawn."""
     runs = len(names_of(rows))
     words = (
@@ -180,7 +181,7 @@ def caption(kind: Kind, rows: Rows) -> str:
     return words
 
 
-def notes(rows: Rows, folders: Sequence[Path]) -> list[str]:
+def notes(rows: pd.DataFrame, folders: Sequence[Path]) -> list[str]:
     """How the errors were measured and joined."""
     found = [
         "Both models learn from the same batches. Models are tested on transitions that they do not learn from.",
@@ -202,7 +203,7 @@ def notes(rows: Rows, folders: Sequence[Path]) -> list[str]:
     return found
 
 
-def late_shares(rows: Rows) -> list[dict[str, object]]:
+def late_shares(rows: pd.DataFrame) -> list[dict[str, object]]:
     """Share of the change that is not explained at the end of training, for all that was measured by each model."""
     table = []
     for probe, (*_, words) in PROBES.items():
@@ -217,11 +218,11 @@ def in_words(value: float, low: float, high: float) -> str:
     return f"{value:.3g}" + (f" ({low:.3g} to {high:.3g})" if np.isfinite(low) else "")
 
 
-def of_several(rows: Rows, folders: Sequence[Path]) -> list[str]:
+def of_several(rows: pd.DataFrame, folders: Sequence[Path]) -> list[str]:
     """Notes on how runs were joined."""
     found = [f"The bootstrap has {RESAMPLES} resamples."]
-    every = [curves(rows, probe, model, "mse") for probe in PROBES for model in MODELS]
-    if any(not one.shared.all() for one in every):
+    every = [errors(rows, probe, model, "mse") for probe in PROBES for model in MODELS]
+    if any(one.shared.x.size < one.x.size for one in every):
         found.append("The mean is drawn at the steps at which all runs that had got so far have a number.")
     if different := differences(folders):
         found.append(f"The runs differ in more than their seed: {', '.join(different)}.")

@@ -7,17 +7,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import GREY
-from coim.experiments.figures.figure import Plot, missing, shown
+from coim.experiments.figures.figure import Cells, Plot, missing, shown
+from coim.experiments.frames import at, read_frame, rows_of
 from coim.experiments.statistics.intervals import RESAMPLES
-from coim.experiments.statistics.retrained import Cells, Line, by_place, pairs, results, sizes
+from coim.experiments.statistics.retrained import by_place, pairs, results, sizes
 from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import CHOSEN, Runs, read_runs
-from coim.tables import read_cells
 
 DESIGNS, TESTS = "figure_2_retrained", "figure_2_tests"
 TESTS_SHOWN = ("environment", "task", "arm", "against", "designs", "runs")
@@ -26,13 +27,13 @@ TESTS_SHOWN += ("difference", "welch_designs_p", "welch_runs_p", "welch_runs_p_h
 
 def plots(study: Path) -> Iterator[Plot]:
     """The designs and the tests between arms, from what ``coim retrain`` wrote."""
-    path, command = study / "retrained" / "designs.csv", f"coim retrain {study}"
+    path, command = study / "retrained" / CHOSEN.file, f"coim retrain {study}"
     if not path.is_file():
         yield from nothing(f"No design was retrained: {command}.")
         return
-    listed = read_cells(path, CHOSEN)
+    listed = read_frame(path, CHOSEN)
     rows, lost = results(path.parent, listed)
-    if not rows:
+    if rows.empty:
         diverged = f"; {lost} diverged before their first return" if lost else ""
         yield from nothing(f"None of {len(listed)} designs is retrained yet: {command}{diverged}.")
         return
@@ -46,13 +47,12 @@ def nothing(words: str) -> Iterator[Plot]:
     yield missing(TESTS, words)
 
 
-def rules(rows: Sequence[Cells], listed: Sequence[Line], lost: int) -> list[str]:
+def rules(rows: pd.DataFrame, listed: pd.DataFrame, lost: int) -> list[str]:
     """Notes on which designs were retrained, how long, and what a diverged training counts."""
     episodes, in_study = (
-        " or ".join(str(count) for count in sorted({int(str(row[name])) for row in rows}))
-        for name in ("episodes", "study_episodes")
+        " or ".join(str(count) for count in sorted({*rows[name]})) for name in ("episodes", "study_episodes")
     )
-    diverged, replaced = (sum(bool(row[name]) for row in rows) for name in ("diverged", "replaced"))
+    diverged, replaced = rows["diverged"].sum(), rows["replaced"].sum()
     counted = f"{len(rows) + lost} of {len(listed)} designs are retrained, {diverged + lost} of them diverged"
     if diverged > replaced:
         counted += "; these count with the best return until then"
@@ -69,20 +69,20 @@ def rules(rows: Sequence[Cells], listed: Sequence[Line], lost: int) -> list[str]
     ]
 
 
-def early(runs: Runs, listed: Sequence[Line]) -> list[str]:
+def early(runs: Runs, listed: pd.DataFrame) -> list[str]:
     """A note on arms whose designs were chosen before all runs were over that the study plans by now."""
-    chosen = {(line["environment"], line["task"], line["arm"]): line.get("over") for line in listed}
+    chosen = listed.drop_duplicates(["environment", "task", "arm"], keep="last")
     words = [
-        f"{', '.join(which)}: {over} of {runs.planned[which]}"
-        for which, over in chosen.items()
-        if over and int(over) < runs.planned[which]
+        f"{environment}, {task}, {arm}: {over:.0f} of {planned}"
+        for environment, task, arm, over in zip(*(chosen[name] for name in ("environment", "task", "arm", "over")))
+        if over < (planned := runs.planned[environment, task, arm])  # NaN, which older studies have, is not
     ]
     if not words:
         return []
     return [f"Chosen before all runs were over ({'; '.join(words)} planned now); designs of the others had no chance."]
 
 
-def origins(rows: Sequence[Cells]) -> list[str]:
+def origins(rows: pd.DataFrame) -> list[str]:
     """A note for each environment and task on where the designs of each arm come from."""
     return [
         f"{', '.join(place)}: {'; '.join(origin(arm, designs) for arm, designs in own.items())}."
@@ -91,41 +91,37 @@ def origins(rows: Sequence[Cells]) -> list[str]:
     ]
 
 
-def origin(arm: str, designs: Sequence[Cells]) -> str:
+def origin(arm: str, designs: pd.DataFrame) -> str:
     """Where the designs of one arm come from."""
-    counts, first = sizes(designs), designs[0]
+    counts, found, kept = sizes(designs), designs["found"].iloc[0], designs["kept"].iloc[0]
     words = f"{arm}: {counts['designs']} designs, distinct bodies {counts['bodies']}, runs {counts['runs']}"
-    if not first["found"]:
+    if math.isnan(found):
         return words
-    found, kept = int(str(first["found"])), int(str(first["kept"]))
-    return f"{words}, chosen as the best of each run, {kept} of {found} ({100 * kept / found:.0f} %)"
+    return f"{words}, chosen as the best of each run, {kept:.0f} of {found:.0f} ({100 * kept / found:.0f} %)"
 
 
-def unequal(own: dict[str, list[Cells]]) -> bool:
+def unequal(own: dict[str, pd.DataFrame]) -> bool:
     """Whether no one share, rounded up to whole designs of each run, gives the number that was kept of each arm."""
-    counts = [
-        (int(str(rows[0]["kept"])), int(str(rows[0]["found"])), sizes(rows)["runs"])
-        for rows in own.values()
-        if rows[0]["found"]
-    ]
-    least = min((kept / found for kept, found, _ in counts), default=math.inf)
-    return any((kept - runs) / found >= least for kept, found, runs in counts)
+    counts = pd.DataFrame([rows.iloc[0][["found", "kept"]] for rows in own.values()], dtype=float)
+    counts["runs"] = [sizes(rows)["runs"] for rows in own.values()]
+    least = (counts["kept"] / counts["found"]).min()
+    return bool(((counts["kept"] - counts["runs"]) / counts["found"] >= least).any())
 
 
-def draw_designs(rows: Sequence[Cells], notes: Sequence[str]) -> Plot:
+def draw_designs(rows: pd.DataFrame, notes: Sequence[str]) -> Plot:
     """A panel for each environment and task."""
     places = by_place(rows)
     widths = [max(2.6, 0.6 + 0.75 * len(own)) for own in places.values()]  # inches, with room for the names of arms
     figure = Figure(figsize=(max(3.6, sum(widths)), 3.4), layout="constrained")
     panels = figure.subplots(1, len(places), squeeze=False, width_ratios=widths)[0]
     for axes, (place, own) in zip(panels, places.items()):
-        draw_boxes(axes, {arm: np.array([row["best_return"] for row in rows], float) for arm, rows in own.items()})
+        draw_boxes(axes, {arm: rows["best_return"].to_numpy() for arm, rows in own.items()})
         axes.set(title=", ".join(place), ylabel="best return, retrained from scratch (1)")
     caption = (
         "Highest return on the best designs that Eq. 5 chose in each run, after training plain SAC on each of them "
         "from scratch. Points: designs. Boxes: quartiles and median. Whiskers: all designs."
     )
-    return Plot(name=DESIGNS, figure=figure, rows=rows, caption=caption, notes=notes)
+    return Plot(name=DESIGNS, figure=figure, rows=rows_of(rows), caption=caption, notes=notes)
 
 
 def draw_boxes(axes: Axes, values: dict[str, np.ndarray]) -> None:
@@ -143,13 +139,13 @@ def draw_boxes(axes: Axes, values: dict[str, np.ndarray]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def draw_tests(table: Sequence[Cells]) -> Plot:
+def draw_tests(table: pd.DataFrame) -> Plot:
     """Differences with their intervals, a line for each pair and a panel for each environment and task."""
-    if not table:
+    if table.empty:
         return missing(TESTS, "No two arms that are compared have retrained designs.")
-    places = list(dict.fromkeys((str(row["environment"]), str(row["task"])) for row in table))
-    own = {place: [row for row in table if (row["environment"], row["task"]) == place] for place in places}
-    figure, grid = new_figure(sum(0.8 + 0.3 * len(rows) for rows in own.values()), len(places))
+    places = table[["environment", "task"]].drop_duplicates().itertuples(index=False, name=None)
+    own = {place: rows_of(at(table, place)) for place in places}
+    figure, grid = new_figure(sum(0.8 + 0.3 * len(rows) for rows in own.values()), len(own))
     for axes, (place, rows) in zip(grid, own.items()):
         draw_differences(axes, rows)
         axes.set(title=", ".join(place))
@@ -169,7 +165,8 @@ def draw_tests(table: Sequence[Cells]) -> Plot:
         "without a difference, of five runs with five designs, welch_designs_p is below 0.05 in 23 %, welch_runs_p in "
         "5 %, and the interval leaves out 0 in 13 %.",
     )
-    return Plot(name=TESTS, figure=figure, rows=table, caption=caption, notes=notes, table=shown(table, TESTS_SHOWN))
+    rows = rows_of(table)
+    return Plot(name=TESTS, figure=figure, rows=rows, caption=caption, notes=notes, table=shown(rows, TESTS_SHOWN))
 
 
 def draw_differences(axes: Axes, rows: Sequence[Cells]) -> None:

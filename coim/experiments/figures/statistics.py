@@ -7,14 +7,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import BLACK, GREY, put_legend
 from coim.experiments.figures.figure import Plot, missing, shown
 from coim.experiments.figures.legend import point_entries
+from coim.experiments.frames import at, rows_of
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, interval, iqm, mean
-from coim.experiments.statistics.measures import MEASURES, Cells, Measured, comparisons, limits, measure, predictions
+from coim.experiments.statistics.measures import MEASURES, NUMBERS, Cells, comparisons, limits, measures, predictions
 from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
@@ -32,21 +34,21 @@ PAIRS_SHOWN += ("welch_p_holm", "paired_p_holm", "detectable")
 def plots(study: Path) -> Iterator[Plot]:
     """Arms, pairs of arms, predictions, runs."""
     runs = read_runs(study)
-    measured = [measure(run, runs.failure((run.environment, run.task))) for run in runs.found]
+    measured = measures(runs)
     yield arms(runs, measured)
     yield pairs(runs, measured)
     yield predicted(runs)
     yield spent(runs, measured)
 
 
-def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
+def arms(runs: Runs, measured: pd.DataFrame) -> Plot:
     """Area and final best return of every arm, with a table of all measures of an arm."""
     rows, places = [], []
     for place in runs.places:
-        own = [m for m in measured if (m.run.environment, m.run.task) == place]
-        if any(m.run.over and math.isfinite(m.final) for m in own):
+        own = at(measured, place)
+        if own["final"][own["over"]].notna().any():
             places.append(place)
-            rows += [summary(runs, place, arm, [m for m in own if m.run.arm == arm]) for arm in runs.arms_at(place)]
+            rows += [summary(runs, place, arm, at(own, place, arm)) for arm in runs.arms_at(place)]
     if not places:
         return missing("statistics_arms", "No run has tried all its designs yet.", runs.in_words(runs.arms))
     figure, grid = new_figure(0.4 + (2.4 + room_for_names(runs.arms)) * len(places), len(places), len(MEASURES))
@@ -83,32 +85,31 @@ def arms(runs: Runs, measured: Sequence[Measured]) -> Plot:
     )
 
 
-def summary(runs: Runs, place: Place, arm: str, own: Sequence[Measured]) -> Cells:
-    """A row of the table of arms."""
-    over = [m for m in own if m.run.over]
-    diverged = sum(m.run.diverged for m in own)
+def summary(runs: Runs, place: Place, arm: str, own: pd.DataFrame) -> Cells:
+    """A row of the table of arms, from the measures of the arm's runs."""
+    over = own[own["over"]]
     row: Cells = {"environment": place[0], "task": place[1], "arm": arm, "planned": runs.planned[*place, arm]}
-    row |= {"over": len(over), "diverged": diverged, "diverged_share": diverged / len(own) if own else np.nan}
+    diverged = int(own["diverged"].sum())
+    row |= {"over": len(over), "diverged": diverged, "diverged_share": diverged / len(own) if len(own) else np.nan}
     for name in MEASURES:
-        values = np.array([getattr(m, name) for m in over])
-        row |= {f"{name}_mean": float(mean(values)) if over else np.nan}
-        row |= {f"{name}_iqm": float(iqm(values)) if over else np.nan} | limits(f"{name}_iqm", iqm, values)
+        values = over[name].to_numpy()
+        row |= {f"{name}_mean": float(mean(values)) if len(over) else np.nan}
+        row |= {f"{name}_iqm": float(iqm(values)) if len(over) else np.nan} | limits(f"{name}_iqm", iqm, values)
     for name in OF_SEARCH:
-        values = np.array([getattr(m, name.removeprefix("rank_")) for m in over])
-        values = values[np.isfinite(values)]
+        values = over[name.removeprefix("rank_")].dropna().to_numpy()
         row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
         row |= {f"{name}_runs": values.size}
     for name in ("hours", "updates"):
-        row[name] = float(np.mean([getattr(m, name) for m in over])) if over else np.nan
+        row[name] = float(mean(over[name].to_numpy())) if len(over) else np.nan
     return row
 
 
-def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: Sequence[Measured]) -> None:
+def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: pd.DataFrame) -> None:
     """One measure of every arm of one environment and task."""
     for x, arm in enumerate(runs.arms_at(place)):
-        here = [m for m in measured if (m.run.environment, m.run.task) == place and m.run.arm == arm and m.run.over]
-        values, colour = np.array([getattr(m, name) for m in here]), arm_named(arm).colour
-        if not here:
+        here = at(measured[measured["over"]], place, arm)
+        values, colour = here[name].to_numpy(), arm_named(arm).colour
+        if here.empty:
             continue
         spread = x + np.linspace(-0.22, 0.22, len(here) + 2)[1:-1]
         axes.scatter(spread, values, s=12, alpha=0.6, linewidth=0, **arm_named(arm).point)
@@ -137,9 +138,9 @@ def room_for_names(arms: Sequence[str]) -> float:
     return longest * math.sin(math.radians(angle_of_names(arms)))
 
 
-def pairs(runs: Runs, measured: Sequence[Measured]) -> Plot:
+def pairs(runs: Runs, measured: pd.DataFrame) -> Plot:
     """Probability of improvement of every pair of arms that is compared, with the tests as a table."""
-    rows = comparisons(runs, measured)
+    rows = rows_of(comparisons(runs, measured))
     if not rows:
         return missing("statistics_pairs", "No two arms have runs that are over.", runs.in_words(runs.arms))
     figure, grid = new_figure(0.9 + 0.26 * max(4, len(rows) // 2), 1, len(MEASURES))
@@ -186,7 +187,7 @@ def predicted(runs: Runs) -> Plot:
     """Q(xi) before a body was built against the best return on it, both as reward per step."""
     rows: list[Cells] = []
     places = [
-        place for place in runs.places if any(predictions(run) for arm in runs.arms for run in runs.of(place, arm))
+        place for place in runs.places if any(len(predictions(run)) for arm in runs.arms for run in runs.of(place, arm))
     ]
     if not places:
         return missing("statistics_predictions", "No design has both a prediction and a best return yet.")
@@ -198,7 +199,7 @@ def predicted(runs: Runs) -> Plot:
             own = [
                 head | {"seed": run.seed, "run": run.number} | {key: row[key] for key in PREDICTED}
                 for run in runs.of(place, arm)
-                for row in predictions(run)
+                for row in rows_of(predictions(run))
             ]
             x, y = ([row[key] for row in own] for key in PREDICTED[-2:])
             axes.scatter(x, y, s=12, alpha=0.6, linewidth=0, **arm_named(arm).point)
@@ -222,43 +223,26 @@ def predicted(runs: Runs) -> Plot:
     return Plot(name="statistics_predictions", figure=figure, rows=rows, caption=caption, notes=notes)
 
 
-OF_RUN = (
-    "area",
-    "final",
-    "search_gain",
-    "correlation",
-    "correlation_given_order",
-    "bias_optimised",
-    "bias_random",
-    "hours",
-    "episode_seconds",
-    "updates",
-)
 PREDICTED = ("design", "kind", "predicted", "best_return", "predicted_per_step", "return_per_step")
 
 
-def spent(runs: Runs, measured: Sequence[Measured]) -> Plot:
+def spent(runs: Runs, measured: pd.DataFrame) -> Plot:
     """Wall-clock and updates of every run; the CSV has all measures of a run."""
-    if not measured:
+    if measured.empty:
         return missing("statistics_runs", "No run has begun.", runs.in_words(runs.arms))
-    rows: list[Cells] = [
-        {"environment": m.run.environment, "task": m.run.task, "arm": m.run.arm, "seed": m.run.seed}
-        | {"run": m.run.number, "state": m.run.state, "designs": len(m.run.designs), "planned": m.run.num_designs}
-        | {name: getattr(m, name) for name in OF_RUN}
-        for m in measured
-    ]
-    places = [place for place in runs.places if any((m.run.environment, m.run.task) == place for m in measured)]
+    head = ["environment", "task", "arm", "seed", "run", "state", "designs", "planned"]
+    rows = rows_of(measured[[*head, *NUMBERS]])
+    places = [place for place in runs.places if len(at(measured, place))]
     figure, grid = new_figure(0.4 + (2.2 + room_for_names(runs.arms)) * len(places), len(places), 2)
     labels = {"hours": "wall-clock of the cell (h)", "updates": "updates (number)"}
     for axes, (place, name) in zip(grid, ((place, name) for place in places for name in labels)):
-        here = [m for m in measured if (m.run.environment, m.run.task) == place]
         for x, arm in enumerate(runs.arms_at(place)):
-            values = [getattr(m, name) for m in here if m.run.arm == arm]
+            values = at(measured, place, arm)[name].to_numpy()
             spread = x + np.linspace(-0.25, 0.25, len(values) + 2)[1:-1]
             axes.scatter(spread, values, s=14, alpha=0.7, linewidth=0, **arm_named(arm).point)
         name_arms(axes, runs.arms_at(place))
         axes.set(ylabel=labels[name], title=", ".join(place))
-        axes.set_ylim(0, 1.1 * max(getattr(m, name) for m in here))
+        axes.set_ylim(0, 1.1 * at(measured, place)[name].max())
     caption = (
         "Wall-clock and updates of every run, also of those under way. Points: runs. Updates are those of both "
         "learners and the ensemble together."

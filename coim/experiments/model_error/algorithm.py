@@ -22,6 +22,7 @@ from coim.designs import DesignGenerator, NoisyDesigns, RandomDesigns
 from coim.envs import MorphEnv
 from coim.events import DesignChosen, EpisodeDone, Event
 from coim.experiments.model_error.errors import change_variance, mean_squares, persistence_error, prediction_error
+from coim.experiments.model_error.tables import ERRORS
 from coim.experiments.model_error.test_rows import Probes, joined
 from coim.experiments.run.results import Table
 from coim.learners.divergence import Divergence
@@ -29,14 +30,7 @@ from coim.learners.dynamics import DynamicsLearner
 from coim.learners.sac import SACLearner
 from coim.position import Position
 from coim.randomness import restore_generator
-from coim.tables import Layout
 from coim.updates import Training
-
-COLUMNS = ["run", "design", "episode", "env_steps", "probe", "predict", "mse", "normalised", "rows", "impossible"]
-FILE = "model_error.csv"
-LAYOUT = Layout(
-    needed=tuple(COLUMNS), words=("probe", "predict"), counts=("run", "design", "episode", "env_steps", "rows")
-)
 
 
 class ProbedCoAdaptation:
@@ -60,7 +54,7 @@ class ProbedCoAdaptation:
         algorithm: one whose model imagines.
         other: the second learner, made by `other_learner`.
         probes: collects the rows that models are measured on.
-        folder: the run folder; `FILE` grows in it.
+        folder: the run folder; `ERRORS` grows in it.
         every: episodes of a design between two measurements; its last episode is always followed by one.
         sigma: standard deviation of the noisy designs.
         seed: seeds all that is drawn for the measurements.
@@ -81,7 +75,7 @@ class ProbedCoAdaptation:
         seed: int,
     ) -> None:
         self.algorithm, self.other, self.probes = algorithm, other, probes
-        self.every, self.seed, self.path = every, seed, folder / FILE
+        self.every, self.seed, self.path = every, seed, folder / ERRORS.file
         spec = algorithm.env.design_spec
         self.swaps: dict[str, DesignGenerator] = {
             "noisy": NoisyDesigns(spec, sigma=sigma),
@@ -175,12 +169,12 @@ class ProbedCoAdaptation:
         # Beside those that will be seen, wherever the run was before.
         saved = [TensorDict(rows, [len(rows["design"]), runs]).unflatten_keys(".") for rows in probed["seen"]]
         self.seen = [rows.to(self.algorithm.device) for rows in saved]
-        self._table = Table(self.path, COLUMNS, keep=probed["csv_rows"])
+        self._table = Table(self.path, ERRORS.header(), keep=probed["csv_rows"])
 
     def _begun_table(self) -> Table:
         """The CSV file, with its header."""
         if self._table is None:
-            self._table = Table(self.path, COLUMNS)
+            self._table = Table(self.path, ERRORS.header())
         return self._table
 
     def _asked(self) -> dict[str, int]:
@@ -228,8 +222,9 @@ class ProbedCoAdaptation:
         episode = event.episode + 1 if isinstance(event, EpisodeDone) else 0
         counts, at = valid.sum(0).tolist(), (event.index + 1, episode, self.position.env_steps, probe)
         shares = [None] * len(counts) if impossible_share is None else impossible_share.tolist()
-        self._begun_table().append(
-            [run, *at, predict, *square, count, share]
+        table = self._begun_table()
+        table.append(
+            dict(zip(table.columns, [run, *at, predict, *square, count, share]))
             for predict, error in errors.items()
             for run, (square, count, share) in enumerate(
                 zip(zip(*(x.tolist() for x in mean_squares(error, variance, valid))), counts, shares)

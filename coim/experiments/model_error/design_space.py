@@ -17,12 +17,10 @@ from torch import Tensor
 
 from coim.experiments.model_error.errors import Model
 from coim.experiments.model_error.placed_simulator import PlacedSimulator
-from coim.tables import Layout, design_columns
+from coim.tables import design_columns
 
 SIDE = 41  # points along each of the two directions
 AREA = 0.05  # of the square that two entries of a design span: of less, a picture shows next to nothing
-FILE = "design_space.csv"
-LAYOUT = Layout(needed=("state", "point", "pc_1", "pc_2", "depth"), words=("point",), counts=("state",), grows=False)
 
 
 def principal_directions(designs: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,9 +9,9 @@ import torch
 
 from coim.envs import MorphEnv
 from coim.experiments.model_error.algorithm import ProbedCoAdaptation, other_learner
-from coim.experiments.model_error.design_space import FILE, SIDE, design_space, principal_directions, with_area
+from coim.experiments.model_error.design_space import SIDE, design_space, principal_directions, with_area
 from coim.experiments.model_error.errors import change_variance
-from coim.experiments.model_error.tables import FOLDER
+from coim.experiments.model_error.tables import CHANGES, FOLDER
 from coim.experiments.model_error.test_rows import Probes, joined
 from coim.experiments.run.atomic_write import as_csv, write_whole
 from coim.experiments.run.build import build
@@ -103,10 +103,10 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
     can be built. Everything is computed on the CPU, where the simulator is, with copies of the models.
     """
     if not probed.seen:
-        return f"no {FILE}: the run ended before its first measurement"
+        return f"no {CHANGES.file}: the run ended before its first measurement"
     learning = [run for run in range(probed.env.numel()) if run not in probed.divergence.places]
     if not learning:
-        return f"no {FILE}: the run diverged, and its model stands still since"
+        return f"no {CHANGES.file}: the run diverged, and its model stands still since"
     run = learning[0]
     seen = joined(probed.seen)[:, run].cpu()
     tried = torch.stack([rows["design"][0, run] for rows in probed.seen]).cpu()
@@ -121,10 +121,12 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
         shown = with_area(seen["design"][order], principal_directions(tried)[0], bounds)
         chosen = order[shown][:STATES]
         if not len(chosen):
-            return f"no {FILE}: the plane of the two components leaves the bounds right beside every design tried"
+            return (
+                f"no {CHANGES.file}: the plane of the two components leaves the bounds right beside every design tried"
+            )
         rows = design_space(models, simulator, seen[chosen], tried, variance, bounds, side=SIDE)
     except ValueError as error:
-        return f"no {FILE}: {error}"
-    written = ({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
-    write_whole(folder / FILE, as_csv(list(rows[0]), written))
-    return f"model errors: {probed.path}\ndesign space: {folder / FILE}"
+        return f"no {CHANGES.file}: {error}"
+    cells = ({key: f"{x:.7g}" if isinstance(x, float) else x for key, x in row.items()} for row in rows)
+    write_whole(folder / CHANGES.file, as_csv(list(rows[0]), cells))
+    return f"model errors: {probed.path}\ndesign space: {folder / CHANGES.file}"

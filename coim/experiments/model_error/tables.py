@@ -1,24 +1,54 @@
-"""Runs whose models were measured, joined where they are runs of one thing.
-
-Shapes: R runs, X training steps.
-"""
+"""Join the measurements of runs that share a configuration."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
+from coim.experiments.frames import Curves, curves
 from coim.experiments.statistics.intervals import mean, over_runs
 from coim.run_folder import read_config
+from coim.tables import DESIGN_PREFIX, Layout
 
 FOLDER = "model_error"  # of a study
+ERRORS = Layout(  # in the folder of a run whose models are measured
+    file="model_error.csv",
+    columns={
+        "run": int,
+        "design": int,
+        "episode": int,
+        "env_steps": int,
+        "probe": str,
+        "predict": str,
+        "mse": float,
+        "normalised": float,
+        "rows": int,
+        "impossible": float,
+    },
+    needed=("run", "design", "episode", "env_steps", "probe", "predict", "mse", "normalised", "rows", "impossible"),
+)
+CHANGES = Layout(  # beside it; and two columns of the change by each model and by the simulator
+    file="design_space.csv",
+    columns={
+        "state": int,
+        "point": str,
+        "pc_1": float,
+        "pc_2": float,
+        DESIGN_PREFIX: float,
+        "depth": float,
+        "share_1": float,
+        "share_2": float,
+    },
+    needed=("state", "point", "pc_1", "pc_2", "depth"),
+    grows=False,
+)
 LAST = 0.25  # share of the training steps that numbers in a caption are of
 PLACES = ("seed", "num_runs", "name", "out", "resume", "wandb", "quiet", "threads", "checkpoint_every")
-Row = dict[str, str]
+MEASUREMENT = ["run", "env_steps", "probe"]  # columns that name one measurement of several models in a folder
 
 
 class Kind(NamedTuple):
@@ -64,91 +94,71 @@ def differences(folders: Sequence[Path]) -> list[str]:
     return [name for name in names if any(one.get(name) != settings[0].get(name) for one in settings)]
 
 
-def with_shares(rows: Sequence[Row], folder: str, seed: int) -> list[dict[str, object]]:
-    """Measurements of one folder with the share of the change that is not explained.
+def with_shares(rows: pd.DataFrame, folder: str, seed: int) -> pd.DataFrame:
+    """Add to the measurements of one folder the share of the change that is not explained.
 
     Args:
-        rows: of a run or a fleet.
-        folder: as the rows shall call it.
-        seed: of the run.
+        rows: of ``model_error.csv``, of one run or of several.
+        folder: name of the folder in the result.
+        seed: of the folder's settings.
 
     Returns:
         The rows with ``folder`` and ``seed`` before them and ``share`` behind them: the error as a multiple of that of
         predicting no change on the same transitions, NaN where none counts or nothing changes.
     """
-    still = {
-        (row["run"], row["env_steps"], row["probe"]): float(row["normalised"])
-        for row in rows
-        if row["predict"] == "nothing"
-    }
-    found = []
-    for row in rows:
-        unit = still.get((row["run"], row["env_steps"], row["probe"]), np.nan)
-        share = float(row["normalised"]) / unit if unit > 0 else np.nan
-        found.append({"folder": folder, "seed": seed, **row, "share": share})
+    still = rows.loc[rows["predict"] == "nothing", [*MEASUREMENT, "normalised"]]
+    unit = rows[MEASUREMENT].merge(still, how="left", on=MEASUREMENT)["normalised"].set_axis(rows.index)
+    share = rows["normalised"] / unit.where(unit > 0)
+    found = rows.assign(share=share)
+    found.insert(0, "folder", folder)
+    found.insert(1, "seed", seed)
     return found
 
 
-@dataclass(frozen=True)
-class Curves:
-    """One error over training.
+def errors(rows: pd.DataFrame, probe: str, model: str, unit: str) -> Curves:
+    """The error of a model on a probe over the training steps, a curve for each run of each folder.
 
-    Attributes:
-        steps: training steps of one run, ``[X]``, rising.
-        runs: ``[R, X]``, NaN where a run was not measured or has no number.
+    Args:
+        rows: see `with_shares`.
+        probe: ``seen``, ``next``, ...
+        model: what it predicts: ``delta``, ``next`` or ``nothing``.
+        unit: ``mse``, ``normalised`` or ``share``.
     """
-
-    steps: np.ndarray
-    runs: np.ndarray
-
-    @property
-    def shared(self) -> np.ndarray:
-        """Steps at which every run that has got so far has a number, ``[X]`` bool.
-
-        Elsewhere a mean would be of other runs than beside it, and jump from one to the other.
-        """
-        known = np.isfinite(self.runs)
-        beyond = np.flip(np.cumsum(np.flip(known, 1), 1), 1) == 0  # no number from here on: it is over, or under way
-        return (known | beyond).all(0) & known.any(0)
-
-    def mean(self) -> tuple[np.ndarray, ...]:
-        """Steps that are shared, and there the mean over runs, the ends of its interval and the number of runs."""
-        if not self.steps.size:
-            return (self.steps,) * 5
-        return self.steps[self.shared], *over_runs(self.runs[:, self.shared], mean)
+    own = rows[(rows["probe"] == probe) & (rows["predict"] == model)]
+    return curves(own, "env_steps", unit, runs=("folder", "run"))
 
 
-def curves(rows: Sequence[dict[str, object]], probe: str, model: str, unit: str) -> Curves:
-    """What was measured of a probe by a model in a unit, a line for each run of each folder."""
-    runs: dict[tuple[object, object], dict[int, float]] = {}
-    for row in rows:
-        if (row["probe"], row["predict"]) == (probe, model):
-            runs.setdefault((row["folder"], row["run"]), {})[int(str(row["env_steps"]))] = float(str(row[unit]))
-    steps = sorted({step for run in runs.values() for step in run})
-    values = [[run.get(step, np.nan) for step in steps] for run in runs.values()]
-    return Curves(np.array(steps, dtype=int), np.array(values, dtype=float).reshape(len(runs), len(steps)))
+def mean_error(rows: pd.DataFrame, probe: str, model: str, unit: str) -> tuple[np.ndarray, ...]:
+    """The mean of `errors` over runs, at the steps at which every run that has got so far has a number.
+
+    Returns:
+        The steps, and there the mean, the ends of its interval and the number of runs, ``[X]`` each.
+    """
+    shared = errors(rows, probe, model, unit).shared
+    return shared.x, *over_runs(shared.y, mean)
 
 
-def late_share(rows: Sequence[dict[str, object]], probe: str, model: str) -> tuple[float, float, float]:
+def late_share(rows: pd.DataFrame, probe: str, model: str) -> tuple[float, float, float]:
     """Error over the last part of training as a share of the error of predicting no change.
 
-    Of each run the sum of its errors over the sum of those of predicting no change, so that a measurement in which
+    For each run the sum of its errors over the sum of those of predicting no change, so that a measurement in which
     little moves counts little; then the mean over the runs that have one.
 
     Returns:
         The share, and the ends of its interval; NaN where there is no number.
     """
-    errors, still = (curves(rows, probe, name, "normalised") for name in (model, "nothing"))
-    late = errors.steps > first_late_step(rows)
-    both = np.isfinite(errors.runs) & np.isfinite(still.runs) & late
-    error, change = (np.where(both, found.runs, 0.0).sum(1, keepdims=True) for found in (errors, still))
-    share = np.divide(error, change, out=np.full_like(error, np.nan), where=change > 0)
-    if not np.isfinite(share).any():
+    late = rows[(rows["probe"] == probe) & (rows["env_steps"] > first_late_step(rows))]
+    by_model = late.pivot(index=["folder", "run", "env_steps"], columns="predict", values="normalised")
+    pairs = by_model.reindex(columns=[model, "nothing"])
+    pairs = pairs[np.isfinite(pairs.to_numpy()).all(axis=1)]
+    error, change = (pairs[name].groupby(level=["folder", "run"]).sum() for name in pairs)
+    share = (error / change.where(change > 0)).dropna().to_numpy()
+    if not share.size:
         return np.nan, np.nan, np.nan
-    value, low, high, _ = over_runs(share, mean)
+    value, low, high, _ = over_runs(share[:, None], mean)
     return float(value[0]), float(low[0]), float(high[0])
 
 
-def first_late_step(rows: Sequence[dict[str, object]]) -> int:
+def first_late_step(rows: pd.DataFrame) -> int:
     """Training steps after which the last part begins."""
-    return round((1 - LAST) * max(int(str(row["env_steps"])) for row in rows))
+    return round((1 - LAST) * int(rows["env_steps"].max()))

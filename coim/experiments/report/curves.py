@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from coim.experiments.drawing.palette import BLACK, GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
-from coim.experiments.run.records import Curves, Record, Row, curves
+from coim.experiments.frames import Curves, curves
+from coim.experiments.run.records import Record
 
 STEPS = "training steps of one run"
 MANY_MARKS = 120
@@ -32,7 +34,7 @@ def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = Tru
 
 def episodes_in_a_point(record: Record) -> int:
     """Episodes that a point of a curve over training steps is the mean of."""
-    return max(1, math.ceil(len({row["env_steps"] for row in record.episodes}) / MOST_EPISODES))
+    return max(1, math.ceil(record.episodes["env_steps"].nunique() / MOST_EPISODES))
 
 
 def points_in_words(records: Sequence[Record]) -> str:
@@ -66,43 +68,42 @@ def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> Non
         found = curves(record.designs, "design", column)
         line = style | ({"color": GREY} if len(records) == 1 and len(found.y) == 1 else {})
         plot_curves(axes, found, label=literal(record.name), **line)
-        means = dict(zip(found.x.tolist(), found.mean.tolist()))
-        finished = {row["design"] for row in record.designs if row["finished"]}
-        rows = {
-            row["design"]: row | {column: means.get(row["design"], math.nan), "finished": row["design"] in finished}
-            for row in record.designs
-        }
-        mark_kinds(axes, list(rows.values()), column, style["color"] if len(records) > 1 else None)
-        mark_divergences(axes, [row for row in record.designs if row["diverged"]], "design", column)
+        finished = record.designs.groupby("design")["finished"].any()
+        rows = record.designs.drop_duplicates("design", keep="last").set_index("design", drop=False).sort_index()
+        means = pd.Series(found.mean, found.x).reindex(rows.index)
+        rows = rows.assign(**{column: means, "finished": finished})
+        mark_kinds(axes, rows, column, style["color"] if len(records) > 1 else None)
+        mark_divergences(axes, record.designs[record.designs["diverged"] != ""], "design", column)
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-def mark_kinds(axes: Axes, rows: Sequence[Row], column: str, colour: str | None = None, x: str = "design") -> None:
+def mark_kinds(axes: Axes, rows: pd.DataFrame, column: str, colour: str | None = None, x: str = "design") -> None:
     """A mark at each design by its kind; ``colour`` overrules the kind's own."""
     for kind, (own, marker) in KINDS.items():
         for finished in (True, False):
-            points = [(row[x], row[column]) for row in rows if (row["kind"], row["finished"]) == (kind, finished)]
-            if points:
+            points = rows[(rows["kind"] == kind) & (rows["finished"] == finished)]
+            if not points.empty:
                 paint = colour or own
                 fill = paint if finished else "white"
                 size = 22 if len(rows) <= MANY_MARKS else 9
-                axes.scatter(*zip(*points), s=size, facecolor=fill, edgecolor=paint, marker=marker, zorder=4)
+                axes.scatter(
+                    points[x], points[column], s=size, facecolor=fill, edgecolor=paint, marker=marker, zorder=4
+                )
 
 
 def _under_way(record: Record) -> bool:
     """Whether there is a design that no run has finished."""
-    finished = {row["design"] for row in record.designs if row["finished"]}
-    return any(row["design"] not in finished for row in record.designs)
+    return not record.designs.groupby("design")["finished"].any().all()
 
 
-def mark_divergences(axes: Axes, rows: Sequence[Row], x: str, y: str) -> None:
+def mark_divergences(axes: Axes, rows: pd.DataFrame, x: str, y: str) -> None:
     """A cross where a run diverged."""
-    axes.scatter([row[x] for row in rows], [row[y] for row in rows], s=45, color=BLACK, marker="x", zorder=5)
+    axes.scatter(rows[x], rows[y], s=45, color=BLACK, marker="x", zorder=5)
 
 
 def cross_handles(records: Sequence[Record]) -> list[Line2D]:
     """Entry of a legend for the crosses, if there are any."""
-    there = any(record.diverged for record in records)
+    there = any(len(record.diverged) for record in records)
     return [Line2D([], [], color=BLACK, marker="x", linestyle="", label="run diverged")] if there else []
 
 
@@ -120,7 +121,7 @@ def explain(
         Line2D([], [], label=literal(r.name), **style_of(i, len(records))) for i, r in enumerate(records) if several
     ]
     if kinds:
-        there = [row["kind"] for record in records for row in record.designs]
+        there = [kind for record in records for kind in record.designs["kind"]]
         handles += kind_handles(there, GREY if several else None)
         if any(_under_way(record) for record in records):
             hollow = {"markerfacecolor": "white", "markeredgecolor": GREY}
@@ -132,6 +133,5 @@ def explain(
 
 def mark_builds(axes: Axes, record: Record) -> None:
     """A light line wherever the next body was built."""
-    first = {row["design"]: row["env_steps"] for row in reversed(record.episodes)}
-    for steps in list(dict(sorted(first.items())).values())[1:]:
+    for steps in record.episodes.groupby("design")["env_steps"].first().iloc[1:]:
         axes.axvline(steps, color=LIGHT, linewidth=0.6, zorder=0)

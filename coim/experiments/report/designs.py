@@ -7,15 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import spearmanr
 
 from coim.envs import MorphEnv
 from coim.experiments.drawing.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import GREY, literal, style_of
+from coim.experiments.frames import designs_of, spearman
 from coim.experiments.report.curves import cross_handles, explain, mark_kinds, plot_over_designs
-from coim.experiments.run.records import Record, Row, number
+from coim.experiments.run.records import Record, number
 
 MOST_BODIES = 64  # of one run; of more the best are drawn
 BODIES_COMPARED = 5
@@ -45,7 +46,9 @@ def best_returns(records: Sequence[Record]) -> Picture:
     axes.set(xlabel="design (number)", ylabel="best return of a design (1)")
     explain(figure, records, kinds=True, more=cross_handles(records))
     tops = [
-        f"{r.name}: highest {number(_top(r)['best_return'])} at design {_top(r)['design']}" for r in records if r.best
+        f"{r.name}: highest {number(_top(r)['best_return'])} at design {_top(r)['design']}"
+        for r in records
+        if len(r.best)
     ]
     caption = "Highest return of the deterministic policy on each body, in the order in which they were built."
     return Picture("Best return of each design", caption, "Best return over designs. " + "; ".join(tops), figure)
@@ -57,7 +60,7 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
     size = len(names)
     figure, grid = new_figure(0.6 + 1.7 * math.ceil(size / 2), math.ceil(size / 2), 2, sharex=True)
     for i, (name, axes) in enumerate(zip(names, grid)):
-        spread = [replace(r, designs=[row | {"entry": row["xi"][i]} for row in r.designs]) for r in records]
+        spread = [replace(r, designs=r.designs.assign(entry=designs_of(r.designs)[:, i])) for r in records]
         plot_over_designs(axes, spread, "entry")
         axes.set_title(name, loc="left", fontsize=10)
         axes.set(ylabel="scale factor (1)")
@@ -85,13 +88,14 @@ def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
     title = "Bodies"
     if body is None:
         return Picture(title, f"{records[0].environment} is no environment of coim: its bodies are not drawn.")
-    shown: list[tuple[str, list[Row]]] = []
+    shown: list[tuple[str, pd.DataFrame]] = []
     for record in records:
-        if record.best:
-            run = _top(record)["run"]
-            rows = sorted((row for row in record.designs if row["run"] == run and _known(row)), key=_best_return)
-            best = rows[-(MOST_BODIES if len(records) == 1 else BODIES_COMPARED) :]
-            shown.append((f"{literal(record.name)}, run {run}", sorted(best, key=lambda row: row["design"])))
+        if len(record.best):
+            run = _top(record).name
+            own = record.designs[(record.designs["run"] == run) & np.isfinite(record.designs["best_return"])]
+            ranked = own.sort_values("best_return", kind="stable")
+            best = ranked.tail(MOST_BODIES if len(records) == 1 else BODIES_COMPARED)
+            shown.append((f"{literal(record.name)}, run {run}", best.sort_values("design")))
     if not shown:
         return Picture(title, "No design has a return yet.")
     caption = (
@@ -104,9 +108,13 @@ def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
         shown = [("", rows[i : i + BODIES_IN_A_LINE]) for i in range(0, len(rows), BODIES_IN_A_LINE)]
         caption += f" The best {MOST_BODIES}" if len(rows) == MOST_BODIES else " All"
         caption += (
-            f" of run {rows[0]['run']}, which has the best of all." if records[0].num_runs > 1 else " of the run."
+            f" of run {rows['run'].iloc[0]}, which has the best of all." if records[0].num_runs > 1 else " of the run."
         )
-    numbers = ", ".join(f"design {row['design']}: {number(row['best_return'])}" for _, rows in shown for row in rows)
+    numbers = ", ".join(
+        f"design {design}: {number(best)}"
+        for _, rows in shown
+        for design, best in zip(rows["design"], rows["best_return"])
+    )
     return Picture(title, caption, f"Bodies with their best returns. {numbers}", draw_lines_of_bodies(shown, body))
 
 
@@ -116,7 +124,8 @@ def predictions(records: Sequence[Record]) -> Picture:
     figure, (axes,) = new_figure(3.6)
     found = []
     for index, record in enumerate(records):
-        rows = [row for row in record.designs if row["finished"] and _known(row) and math.isfinite(row["predicted"])]
+        known = np.isfinite(record.designs[["best_return", "predicted"]].to_numpy()).all(axis=1)
+        rows = record.designs[record.designs["finished"] & known]
         colour = style_of(index, len(records))["color"] if len(records) > 1 else None
         mark_kinds(axes, rows, "best_return", colour, x="predicted")
         found.append((f"{record.name}: " if colour else "") + describe_correlation(rows))
@@ -131,14 +140,13 @@ def predictions(records: Sequence[Record]) -> Picture:
     return Picture(title, caption, "Predicted value against best return. " + "; ".join(found), figure)
 
 
-def describe_correlation(rows: Sequence[Row]) -> str:
+def describe_correlation(rows: pd.DataFrame) -> str:
     """Spearman's rank correlation of prediction and best return in words: of one run, or the mean over runs."""
-    by_run = [[row for row in rows if row["run"] == run] for run in sorted({row["run"] for row in rows})]
-    known = [(rank_correlation(own), len(own)) for own in by_run]
-    values = [value for value, _ in known if value is not None]
+    by_run = [own for _, own in rows.groupby("run")]
+    values = [value for own in by_run if math.isfinite(value := spearman(own["predicted"], own["best_return"]))]
     if not values:
         return f"rank correlation not defined (n = {len(rows)} designs)"
-    counts = "/".join(str(n) for n in sorted({n for _, n in known}))
+    counts = "/".join(str(n) for n in sorted({len(own) for own in by_run}))
     if len(values) == 1:
         return f"Spearman's rank correlation {values[0]:.2f} (n = {counts} designs)"
     spread = f"from {min(values):.2f} to {max(values):.2f}"
@@ -147,21 +155,6 @@ def describe_correlation(rows: Sequence[Row]) -> str:
     )
 
 
-def rank_correlation(rows: Sequence[Row]) -> float | None:
-    """Spearman's of one run; None for less than three designs, or where all predictions or all returns are equal."""
-    predicted, achieved = ([row[name] for row in rows] for name in ("predicted", "best_return"))
-    if len(rows) < 3 or len(set(predicted)) == 1 or len(set(achieved)) == 1:
-        return None
-    return float(spearmanr(predicted, achieved).statistic)
-
-
-def _top(record: Record) -> Row:
-    return max(record.best.values(), key=_best_return)
-
-
-def _known(row: Row) -> bool:
-    return math.isfinite(row["best_return"])
-
-
-def _best_return(row: Row) -> float:
-    return row["best_return"]
+def _top(record: Record) -> pd.Series:
+    """The best design of all runs; its name is the number of its run."""
+    return record.best.iloc[record.best["best_return"].argmax()]

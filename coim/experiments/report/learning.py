@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import BLACK, BLUE, GREY, SKY, style_of
+from coim.experiments.frames import curves
 from coim.experiments.report.curves import (
     STEPS,
     cross_handles,
@@ -24,7 +25,7 @@ from coim.experiments.report.curves import (
     points_in_words,
 )
 from coim.experiments.report.designs import Picture
-from coim.experiments.run.records import Record, curves, number
+from coim.experiments.run.records import Record, number
 from coim.pairs import IN_THE_FLOOR
 
 LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
@@ -51,7 +52,7 @@ def learning_curves(records: Sequence[Record]) -> Picture:
         plot_over_steps(axes, records, "return")
         explain(figure, records, more=cross_handles(records))
     for record in records:
-        mark_divergences(axes, [*record.diverged.values()], "env_steps", "return")
+        mark_divergences(axes, record.diverged, "env_steps", "return")
     axes.set(xlabel=f"{STEPS} (1)", ylabel="return of an episode (1)")
     last = [f"{r.name}: {curves(r.episodes, 'env_steps', 'return').mean[-1:].round(2).tolist()}" for r in records]
     caption += points_in_words(records)
@@ -154,22 +155,19 @@ def times(records: Sequence[Record]) -> Picture:
 
 def time_by_part(record: Record) -> dict[str, float]:
     """Seconds of each part over all episodes so far, and what lies between the episodes."""
-    rows = [*{(row["design"], row["episode"]): row for row in record.episodes}.values()]  # the same for all runs
-    names = [name for name in rows[0] if name.startswith("seconds/")]
-    totals = {name.removeprefix("seconds/"): sum(row.get(name, 0.0) for row in rows) for name in names}
+    rows = record.episodes.drop_duplicates(["design", "episode"], keep="last")  # the same for all runs
+    parts = {name: name.removeprefix("seconds/") for name in rows.columns if name.startswith("seconds/")}
+    totals: dict[str, float] = {part: rows[name].sum() for name, part in parts.items()}
     if totals:
-        totals["between episodes"] = max(0.0, rows[-1]["seconds"] - totals.pop("episode", 0.0))
+        totals["between episodes"] = max(0.0, rows["seconds"].iloc[-1] - totals.pop("episode", 0.0))
     return totals
 
 
 def _with_weighted_entropy(record: Record) -> Record:
     alpha = record.settings.get("alpha", math.nan)
-    rows = [
-        row
-        | {f"{who}/alpha_entropy": alpha * row.get(f"{who}/entropy", math.nan) for who in ("individual", "population")}
-        for row in record.episodes
-    ]
-    return replace(record, episodes=rows)
+    entropies = [name for name in record.episodes.columns if name.endswith("/entropy")]
+    weighted = {f"{name.removesuffix('entropy')}alpha_entropy": alpha * record.episodes[name] for name in entropies}
+    return replace(record, episodes=record.episodes.assign(**weighted))
 
 
 def _means(record: Record, column: str) -> np.ndarray:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import pandas as pd
 
 from coim.envs import BODIES, MorphEnv
+from coim.experiments.frames import designs_of
 from coim.experiments.report import designs as figures
 from coim.experiments.report import learning as diagnostics
 from coim.experiments.report.designs import Picture
 from coim.experiments.report.page import FONT, image, note, page, section, table
 from coim.experiments.run.atomic_write import dated_file, naming_out, write_whole
-from coim.experiments.run.records import Record, Row, number, read_records
+from coim.experiments.run.records import Record, number, read_records
 
 
 def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type[MorphEnv] | None = None) -> Path:
@@ -87,18 +87,17 @@ def in_short(records: Sequence[Record]) -> str:
     )
     if len(records) == 1:
         head = ["run", "best return", "design", "kind", *records[0].design_names]
+        best, diverged = records[0].best, records[0].diverged
         rows = [
-            [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, row["xi"])]
-            for run, row in sorted(records[0].best.items())
+            [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, xi)]
+            for (run, row), xi in zip(best.iterrows(), designs_of(best))
         ]
-        if diverged := records[0].diverged:
+        if len(diverged):
             head.append("diverged at")
-            rows = [
-                [*row, diverged[run]["diverged"] if run in diverged else "-"]
-                for run, row in zip(sorted(records[0].best), rows)
-            ]
+            places = diverged["diverged"].reindex(best.index, fill_value="-")
+            rows = [[*row, place] for row, place in zip(rows, places)]
         if len(rows) > 1:
-            mean = statistics.fmean(row["best_return"] for row in records[0].best.values())
+            mean = best["best_return"].mean()
             rows.append([f"mean of {len(rows)} runs", number(mean), *[""] * (len(head) - 2)])
         return section("Best bodies", states + table(head, rows))
     head = ["folder", "runs", "best return, mean", "standard deviation", "lowest", "highest", "designs", "episodes"]
@@ -108,25 +107,28 @@ def in_short(records: Sequence[Record]) -> str:
 
 def compared(record: Record) -> list[str]:
     """A row of the comparison: statistics over the runs of a folder, of each run's best return."""
-    best = [row["best_return"] for row in record.best.values()]
-    mean, low, high = (statistics.fmean(best), min(best), max(best)) if best else (math.nan,) * 3
-    deviation = statistics.stdev(best) if len(best) > 1 else math.nan
-    designs, episodes = (
-        len({(row["design"], row.get("episode")) for row in r}) for r in (record.designs, record.episodes)
+    returns = record.best["best_return"]
+    statistics = (returns.mean(), returns.std(), returns.min(), returns.max())
+    counts = map(
+        str,
+        (
+            record.designs["design"].nunique(),
+            len(record.episodes[["design", "episode"]].drop_duplicates()),
+            len(record.diverged),
+        ),
     )
-    counts = [str(designs), str(episodes), str(len(record.diverged))]
-    return [record.name, str(record.num_runs), *map(number, (mean, deviation, low, high)), *counts]
+    return [record.name, str(record.num_runs), *map(number, statistics), *counts]
 
 
 def state(record: Record) -> str:
     """How far a run is, in a sentence."""
-    last: Row = record.episodes[-1]
-    learning = [row for row in record.designs if row["run"] not in record.diverged]
+    last = record.episodes.iloc[-1]
+    learning = record.designs[~record.designs["run"].isin(record.diverged.index)]
     planned = record.settings.get("num_designs", "?")
     begun = f"started {record.config.get('started', 'at an unknown time')}, {record.num_runs} run(s)"
-    if not learning:
+    if learning.empty:
         return f"{begun}; every run has diverged, the last at {last['diverged']}, and it ended there."
-    if last["design"] == planned and all(row["finished"] for row in learning):
+    if last["design"] == planned and learning["finished"].all():
         return f"{begun}; all {planned} designs are done, after {last['seconds'] / 60:.3g} min."
     where = f"design {last['design']} of {planned}, episode {last['episode']}"
     return f"{begun}; at {where} after {last['seconds'] / 60:.3g} min: going on, or stopped there."
@@ -135,12 +137,12 @@ def state(record: Record) -> str:
 def ill(record: Record) -> list[str]:
     """What a reader must know of runs that have diverged, and of simulations that broke."""
     found = [
-        f"run {run} diverged at {row['diverged']}: its losses or weights were no finite numbers any more. It was "
+        f"run {run} diverged at {place}: its losses or weights were no finite numbers any more. It was "
         "frozen there and has no rows afterwards. Its best return is the best until then; curves over runs are means "
         "of those that were left."
-        for run, row in sorted(record.diverged.items())
+        for run, place in record.diverged["diverged"].items()
     ]
-    broken = sum(row.get("broken", 0.0) for row in record.episodes)
+    broken = record.episodes.get("broken", pd.Series(dtype=float)).sum()
     return [*found, f"{broken:.0f} simulation(s) broke and started again from rest."] if broken > 0 else found
 
 

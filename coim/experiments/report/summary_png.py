@@ -33,10 +33,10 @@ def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
     returns.spines[["top", "right"]].set_visible(False)
     explain(figure, [record], kinds=True, more=cross_handles([record]))
     # The best run's, as on the page: the first run may have diverged before it had many.
-    run = max(record.best.values() or record.designs, key=lambda row: row["best_return"])["run"]
-    own = [row for row in record.designs if row["run"] == run]
-    best = sorted(own, key=lambda row: row["best_return"])[-BODIES_SHOWN:]
-    draw_bodies(bodies, sorted(best, key=lambda row: row["design"]), body)
+    run = record.best["best_return"].idxmax() if len(record.best) else record.designs["run"].iloc[0]
+    own = record.designs[record.designs["run"] == run]
+    best = own.sort_values("best_return", kind="stable").tail(BODIES_SHOWN)
+    draw_bodies(bodies, best.sort_values("design"), body)
     whose = f" of run {run}" if record.num_runs > 1 else ""
     bodies.set_title(f"bodies{whose} at rest: number of the design, best return")
     path = folder / "figures" / "designs.png"

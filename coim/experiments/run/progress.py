@@ -67,9 +67,9 @@ class Progress:
         self._episodes += 1
         last = event.evaluation_return.cpu()
         self._best = last if self._best is None else torch.fmax(self._best, last)
-        if sentence := self._forecast.sentence:
+        if forecast := self._forecast.sentence:
             self.end()
-            self._stream.write(sentence + "\n")
+            self._stream.write(forecast + "\n")
         long, short = self._lines(event, last, self._best)
         if self._live:
             width = shutil.get_terminal_size().columns - 1

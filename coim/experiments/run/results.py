@@ -12,13 +12,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from coim.events import DesignChosen, DesignDone, EpisodeDone, running
+from coim.events import DesignChosen, DesignDone, EpisodeDone
+from coim.experiments.frames import read_frame
 from coim.experiments.run.atomic_write import shortest, telling_full_disk, write_whole
 from coim.experiments.run.interrupt import cannot_write
 from coim.experiments.run.provenance import describe
+from coim.experiments.run.records import number
 from coim.experiments.run.resume import note_resumption, refuse_filled
 from coim.experiments.run.settings import Settings
-from coim.tables import OF_RUN, design_columns, entry_of_column, read_cells, read_columns, same_columns
+from coim.run_folder import DESIGNS, EVALUATIONS, METRICS, Row, design_rows, evaluation_rows, metric_rows
+from coim.tables import Layout, entry_of_column, read_columns, read_table, same_columns
 
 
 class Results:
@@ -60,37 +63,18 @@ class Results:
             write_whole(folder / "config.json", json.dumps(describe(environment, settings), indent=2) + "\n")
         else:
             note_resumption(folder, settings)
-        xi = design_columns(design_names)
-        self._evaluations = self._table(
-            "evaluations.csv",
-            [
-                "run",
-                "design",
-                "kind",
-                *xi,
-                "episode",
-                "training_return",
-                "return",
-                "env_steps",
-                "model_error",
-                "seconds",
-                "diverged",
-            ],
-            keep=rows.get("evaluations"),
-        )
-        self._designs = self._table(
-            "designs.csv",
-            ["run", "design", "kind", *xi, "predicted", "best_return", "diverged"],
-            keep=rows.get("designs"),
-        )
+        self._design_names = design_names
+        self._evaluations = self._table(EVALUATIONS, keep=rows.get("evaluations"))
+        self._designs = self._table(DESIGNS, keep=rows.get("designs"))
         self._metrics: Table | None = None  # its columns are known when the first episode is done
         self._metrics_rows = rows.get("metrics", 0)
 
-    def _table(self, name: str, columns: list[str], keep: int | None) -> Table:
+    def _table(self, layout: Layout, measured: Sequence[str] = (), *, keep: int | None) -> Table:
         """One of the files; the rows that it keeps are read at once, as they will be when the run is over."""
-        table = Table(self.folder / name, columns, keep=keep)
+        path = self.folder / layout.file
+        table = Table(path, layout.header(self._design_names, measured), keep=keep)
         if keep:
-            read_cells(table.path, OF_RUN[name])
+            read_table(path, layout)
         return table
 
     def write(self, event: DesignChosen | EpisodeDone | DesignDone, seconds: float) -> None:
@@ -100,56 +84,17 @@ class Results:
             nothing = [None] * len(event.design)
             self._predicted = nothing if event.predicted is None else event.predicted.tolist()
         elif isinstance(event, EpisodeDone):
-            error = event.metrics.get("model_error")
-            self._evaluations.append(
-                [
-                    run,
-                    event.index + 1,
-                    event.kind,
-                    *event.design[run].tolist(),
-                    event.episode + 1,
-                    float(event.training_return[run]),
-                    float(event.evaluation_return[run]),
-                    event.env_steps,
-                    None if error is None else float(error[run]),
-                    seconds,
-                    where_diverged(event, run),
-                ]
-                for run in running(event)
-            )
-            self._write_metrics(event)
+            self._evaluations.append(evaluation_rows(event, self._design_names, seconds))
+            self._write_metrics(metric_rows(event))
         else:
-            self._designs.append(
-                [
-                    run,
-                    event.index + 1,
-                    event.kind,
-                    *event.design[run].tolist(),
-                    self._predicted[run],
-                    float(event.best_return[run]),
-                    where_diverged(event, run),
-                ]
-                for run in running(event)
-            )
+            self._designs.append(design_rows(event, self._design_names, self._predicted))
 
-    def _write_metrics(self, event: EpisodeDone) -> None:
-        """Append what was measured while learning; ``seconds`` are of all runs together, the same in each row."""
-        parts = sorted(event.seconds)  # learners side by side book theirs in the order in which they end
+    def _write_metrics(self, rows: Sequence[Row]) -> None:
+        """Append what was measured while learning."""
         if self._metrics is None:
-            columns = ["run", "design", "episode", *event.metrics, *(f"seconds/{part}" for part in parts), "diverged"]
-            self._metrics = self._table("metrics.csv", columns, keep=self._metrics_rows or None)
-        seconds = [event.seconds[part] for part in parts]
-        self._metrics.append(
-            [
-                run,
-                event.index + 1,
-                event.episode + 1,
-                *(float(values[run]) for values in event.metrics.values()),
-                *seconds,
-                where_diverged(event, run),
-            ]
-            for run in running(event)
-        )
+            measured = [name for name in rows[0] if name not in METRICS.columns]
+            self._metrics = self._table(METRICS, measured, keep=self._metrics_rows or None)
+        self._metrics.append(rows)
         self._metrics_rows = self._metrics.num_rows
 
     def notes(self) -> dict[str, Any]:
@@ -163,19 +108,10 @@ class Results:
 
     def table(self) -> str:
         """The designs and their best returns, for a terminal."""
-        path = self._designs.path
-        rows = [format_row([*row.values()]) for row in read_cells(path, OF_RUN[path.name])]
-        lines = [[entry_of_column(name) or name for name in read_columns(path)], *rows]
-        widths = [max(map(len, cells)) for cells in zip(*lines)]
-        return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths)) for line in lines)
-
-
-def where_diverged(event: DesignChosen | EpisodeDone | DesignDone, run: int) -> str | None:
-    """Where a run diverged, as a table and a reader have it; None of one that learns."""
-    if run not in event.diverged:
-        return None
-    index, episode = event.diverged[run]
-    return f"design {index + 1}, episode {episode + 1}"
+        designs = read_frame(self._designs.path, DESIGNS)
+        names = {name: entry_of_column(name) or name for name in designs.columns}
+        designs = designs.rename(columns=names).replace("", "-")
+        return designs.to_string(index=False, na_rep="-", float_format=number)
 
 
 class Table:
@@ -191,8 +127,8 @@ class Table:
         ValueError: if the existing file has fewer rows, or other columns.
     """
 
-    def __init__(self, path: Path, columns: list[str], *, keep: int | None = None) -> None:
-        self.path, self.num_rows = path, keep or 0
+    def __init__(self, path: Path, columns: Sequence[str], *, keep: int | None = None) -> None:
+        self.path, self.columns, self.num_rows = path, columns, keep or 0
         if keep is None:
             write_whole(path, ",".join(columns) + "\n")
             return
@@ -203,24 +139,14 @@ class Table:
             raise ValueError(f"{path} has {len(lines) - 1} rows, the checkpoint was made after {keep}; put them back")
         write_whole(path, "\n".join(lines[: 1 + keep]) + "\n")
 
-    def append(self, rows: Iterable[Sequence[Any]]) -> None:
-        cells = [[_cell(value) for value in row] for row in rows]
+    def append(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Append rows, which have a cell for each column."""
+        cells = [[_cell(row[name]) for name in self.columns] for row in rows]
         with telling_full_disk(self.path), self.path.open("a", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(cells)
             file.flush()
             os.fsync(file.fileno())
         self.num_rows += len(cells)
-
-
-def format_row(row: Sequence[str]) -> list[str]:
-    """Cells for a terminal: numbers with four significant digits, a dash for what is not known."""
-    cells = []
-    for cell in row:
-        try:
-            cells.append(cell if cell.isdigit() else f"{float(cell):.4g}")
-        except ValueError:
-            cells.append(cell or "-")
-    return cells
 
 
 def _cell(value: Any) -> Any:

@@ -9,9 +9,10 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import stats
 
 CONFIDENCE = 0.95
@@ -116,16 +117,17 @@ def improvement(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.mean(chances, axis=0)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def holm(p_values: ArrayLike) -> list[float]:
     """P-values of a family of tests, corrected by Holm's step-down method; NaN stays and does not count.
 
     Example:
         >>> holm([0.01, 0.04, 0.03])  # 3 x .01; 2 x .03; .04, but not below the one before
         [0.03, 0.06, 0.06]
     """
-    order = [i for i in np.argsort(p_values) if np.isfinite(p_values[i])]
-    corrected, least = [float("nan")] * len(p_values), 0.0
+    p = np.asarray(p_values, dtype=float).tolist()
+    order = [i for i in np.argsort(p).tolist() if np.isfinite(p[i])]
+    corrected, least = [float("nan")] * len(p), 0.0
     for rank, i in enumerate(order):
-        least = max(least, min(1.0, (len(order) - rank) * p_values[i]))
+        least = max(least, min(1.0, (len(order) - rank) * p[i]))
         corrected[i] = least
     return corrected

@@ -1,20 +1,22 @@
-"""What a run comes to in a few numbers, and how two arms differ in one of them."""
+"""Measure runs in a few numbers, and compare two arms by one of them."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import stats
 from scipy.optimize import brentq
 
-from coim.experiments.run.records import Row
-from coim.experiments.statistics.intervals import holm, improvement, interval, mean
+from coim.experiments.frames import at, design_columns_of, spearman
+from coim.experiments.statistics.intervals import Statistic, holm, improvement, interval, mean
 from coim.experiments.study.arms import pairs_of_arms
-from coim.experiments.study.runs import Run, Runs
+from coim.experiments.study.runs import Place, Run, Runs
 
 Cells = dict[str, object]
 MEASURES = ("area", "final")
@@ -23,99 +25,129 @@ ALPHA, POWER = 0.05, 0.8
 NO_PAIRS: Cells = {"paired_difference_low": math.nan, "paired_difference_high": math.nan}
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Numbers of one run.
+def measures(runs: Runs) -> pd.DataFrame:
+    """Measure every run of a study.
 
-    Attributes:
-        run: whose they are.
-        area: under the best-return curve of Fig. 1, over the number of designs: the mean best return of a design.
-        final: the highest best return of all designs: what is in hand when the budget is spent.
-        search_gain: mean best return of the designs that maximised Q minus that of the random ones, which take turns.
-        correlation: Spearman's, of the prediction Q(xi) before a body was built and the best return on it, over the
-            bodies that came after the first ones.
-        correlation_given_order: the same with the order of building held fixed: Q and returns both rise while the
-            networks learn, whatever the body.
-        bias_optimised: mean of prediction minus best return over the designs that maximised Q, both as reward per
-            step; see `predictions`.
-        bias_random: the same over random designs.
-        hours: wall-clock of the cell.
-        episode_seconds: median over the training episodes, their updates and evaluation included; NaN without a
-            ``metrics.csv``.
-        updates: of all learners and the ensemble.
+    Args:
+        runs: those that have begun are measured.
 
-    All but the last three are NaN while they are not known; area, final and search_gain while the run is under way.
+    Returns:
+        A row for each run, with what `measure` gives, in the order of the ledger.
     """
-
-    run: Run
-    area: float
-    final: float
-    search_gain: float
-    correlation: float
-    correlation_given_order: float
-    bias_optimised: float
-    bias_random: float
-    hours: float
-    episode_seconds: float
-    updates: int
+    columns = ["environment", "task", "arm", "seed", "run", "state", "over", "diverged", "designs", "planned", *NUMBERS]
+    rows = [measure(run, runs.failure((run.environment, run.task))) for run in runs.found]
+    found = pd.DataFrame(rows, columns=columns)
+    return found.astype({"over": bool} | dict.fromkeys(MEASURES, float))  # also where there are no runs
 
 
-def measure(run: Run, failure: float) -> Measured:
-    """A diverged run counts with ``failure`` on each design that it did not reach."""
+NUMBERS = (
+    "area",
+    "final",
+    "search_gain",
+    "correlation",
+    "correlation_given_order",
+    "bias_optimised",
+    "bias_random",
+    "hours",
+    "episode_seconds",
+    "updates",
+)
+
+
+def measure(run: Run, failure: float) -> dict[str, Any]:
+    """Measure one run.
+
+    Args:
+        run: of a study.
+        failure: counts as the best return of a diverged run on each design that it did not reach.
+
+    Returns:
+        What names the run (``environment``, ``task``, ``arm``, ``seed``, ``run``); its ``state``, whether it is
+        ``over`` or ``diverged``, how many ``designs`` it has tried of those ``planned``; and its `NUMBERS`:
+
+        ``area``
+            under the best-return curve of Fig. 1, over the number of designs: the mean best return of a design.
+        ``final``
+            the highest best return of all designs: what is in hand when the budget is spent.
+        ``search_gain``
+            mean best return of the designs that maximised Q minus that of the random ones, which take turns.
+        ``correlation``
+            Spearman's, of the prediction Q(xi) before a body was built and the best return on it, over the bodies that
+            came after the first ones.
+        ``correlation_given_order``
+            the same with the order of building held fixed: Q and returns both rise while the networks learn, whatever
+            the body.
+        ``bias_optimised``
+            mean of prediction minus best return over the designs that maximised Q, both as reward per step; see
+            `predictions`.
+        ``bias_random``
+            the same over random designs.
+        ``hours``
+            wall-clock of the cell.
+        ``episode_seconds``
+            median over the training episodes, their updates and evaluation included; NaN without a ``metrics.csv``.
+        ``updates``
+            of all learners and the ensemble.
+
+        All but the last three are NaN while they are not known; area, final and search_gain while the run is under way.
+    """
     values = run.best_returns(failure) if run.over else np.array([math.nan])
-    chosen = [row for row in predictions(run) if row["kind"] != "first"]
-    if len({row["xi"] for row in chosen}) < 2:
-        chosen = []  # of one body alone there is nothing to rank
-    settings, rows = run.record.settings, [row for row in run.record.episodes if row["run"] == run.number]
+    chosen = predictions(run)
+    chosen = chosen[chosen["kind"] != "first"]
+    if len(chosen[design_columns_of(chosen)].drop_duplicates()) < 2:
+        chosen = chosen[:0]  # with one body alone there is nothing to rank
+    settings, rows = run.record.settings, run.record.episodes
+    own = rows[rows["run"] == run.number]
     an_episode = settings["individual_updates"] + settings["population_updates"]
     learns_model = settings["imagine"] != "none" and settings.get("dream") != "simulator"
     an_episode += settings["model_updates"] * learns_model
-    return Measured(
-        run,
-        area=float(values.mean()),
-        final=float(values.max()),
-        search_gain=best_mean(run, "optimised") - best_mean(run, "random") if run.over else math.nan,
-        correlation=spearman(chosen, "predicted", "best_return"),
-        correlation_given_order=spearman_given(chosen, "predicted", "best_return", given="design"),
-        bias_optimised=bias([row for row in chosen if row["kind"] == "optimised"]),
-        bias_random=bias([row for row in chosen if row["kind"] == "random"]),
-        hours=max(row["seconds"] for row in run.record.episodes) / 3600,
-        episode_seconds=float(np.median([row.get("seconds/episode", math.nan) for row in rows])),
-        updates=len(rows) * an_episode,
-    )
+    return {
+        "environment": run.environment,
+        "task": run.task,
+        "arm": run.arm,
+        "seed": run.seed,
+        "run": run.number,
+        "state": run.state,
+        "over": run.over,
+        "diverged": run.diverged,
+        "designs": len(run.designs),
+        "planned": run.num_designs,
+        "area": float(values.mean()),
+        "final": float(values.max()),
+        "search_gain": best_mean(run, "optimised") - best_mean(run, "random") if run.over else math.nan,
+        "correlation": spearman(chosen["predicted"], chosen["best_return"]),
+        "correlation_given_order": spearman_given(chosen["predicted"], chosen["best_return"], given=chosen["design"]),
+        "bias_optimised": bias(chosen[chosen["kind"] == "optimised"]),
+        "bias_random": bias(chosen[chosen["kind"] == "random"]),
+        "hours": float(rows["seconds"].max()) / 3600,
+        "episode_seconds": float(np.median(own.get("seconds/episode", math.nan))),
+        "updates": len(own) * an_episode,
+    }
 
 
 def best_mean(run: Run, kind: str) -> float:
     """Mean best return of a run's designs of one kind; NaN where there is none."""
-    values = [row["best_return"] for row in run.designs if row["kind"] == kind]
-    return float(np.mean(values)) if values else math.nan
+    values = run.designs["best_return"][run.designs["kind"] == kind]
+    return float(np.mean(values.to_numpy())) if len(values) else math.nan
 
 
-def spearman(rows: Sequence[Row], one: str, other: str) -> float:
-    """Rank correlation of two columns; NaN for less than three rows, or where one of them is the same in all."""
-    x, y = ([row[name] for row in rows] for name in (one, other))
-    if len(rows) < 3 or len(set(x)) == 1 or len(set(y)) == 1:
-        return math.nan
-    return float(stats.spearmanr(x, y).statistic)
+def spearman_given(x: ArrayLike, y: ArrayLike, *, given: ArrayLike) -> float:
+    """Partial rank correlation with a third variable held fixed.
 
-
-def spearman_given(rows: Sequence[Row], one: str, other: str, *, given: str) -> float:
-    """Partial rank correlation of two columns with a third one held fixed.
-
-    NaN for less than four rows, or where the third one says all of one of the others.
+    NaN for less than four values, or where the third variable determines one of the others.
     """
-    x_y, x_z, y_z = (spearman(rows, *pair) for pair in ((one, other), (one, given), (other, given)))
+    x_y, x_z, y_z = spearman(x, y), spearman(x, given), spearman(y, given)
     rest = (1 - x_z**2) * (1 - y_z**2)
-    return (x_y - x_z * y_z) / math.sqrt(rest) if len(rows) > 3 and rest > 1e-12 else math.nan
+    return (x_y - x_z * y_z) / math.sqrt(rest) if len(np.asarray(x)) > 3 and rest > 1e-12 else math.nan
 
 
-def bias(rows: Sequence[Row]) -> float:
+def bias(rows: pd.DataFrame) -> float:
     """Mean of prediction minus best return, both as reward per step; NaN for no rows."""
-    errors = [row["predicted_per_step"] - row["return_per_step"] for row in rows]
-    return float(np.mean(errors)) if errors else math.nan
+    errors = (rows["predicted_per_step"] - rows["return_per_step"]).to_numpy()
+    return float(np.mean(errors)) if len(errors) else math.nan
 
 
-def predictions(run: Run) -> list[Row]:
+def predictions(run: Run) -> pd.DataFrame:
     """Designs with a prediction and a best return, both also as reward per step.
 
     A constant reward r has the discounted value r / (1 - gamma) and, over T steps, the return r T. So (1 - gamma) Q and
@@ -125,39 +157,47 @@ def predictions(run: Run) -> list[Row]:
     and Q holds the entropy bonus of Eq. 3, of up to alpha times the entropy of an action in each step.
     """
     gamma, steps = run.record.settings["gamma"], run.record.settings["episode_steps"]
-    return [
-        row | {"predicted_per_step": (1 - gamma) * row["predicted"], "return_per_step": row["best_return"] / steps}
-        for row in run.designs
-        if math.isfinite(row["predicted"])
-    ]
+    rows = run.designs[np.isfinite(run.designs["predicted"])]
+    return rows.assign(
+        predicted_per_step=(1 - gamma) * rows["predicted"],
+        return_per_step=rows["best_return"] / steps,
+    )
 
 
-def comparisons(runs: Runs, measured: Sequence[Measured]) -> list[Cells]:
-    """Every pair of arms by every measure, in each environment and task and, where there are several, over all.
+def comparisons(runs: Runs, measured: pd.DataFrame) -> pd.DataFrame:
+    """Compare every pair of arms by every measure, in each environment and task and, where there are several, over all.
 
     Holm's correction is over all tests of one measure in the study.
+
+    Args:
+        runs: of the study.
+        measured: see `measures`.
+
+    Returns:
+        A row for each comparison; empty where there is none.
     """
-    rows = []
+    tables = []
     for name in MEASURES:
-        own = [row for arm, against in pairs_of_arms(runs.arms) for row in compare(runs, measured, name, arm, against)]
-        for test in ("welch_p", "paired_p"):
-            for row, corrected in zip(own, holm([float(str(row[test])) for row in own])):
-                row[f"{test}_holm"] = corrected
-        rows += own
-    return rows
+        known = measured[measured["over"] & np.isfinite(measured[name])]
+        pairs = pairs_of_arms(runs.arms)
+        table = pd.DataFrame([row for arm, against in pairs for row in compare(runs, known, name, arm, against)])
+        for test in ("welch_p", "paired_p") if len(table) else ():
+            table[f"{test}_holm"] = holm(table[test])
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
 
 
-def compare(runs: Runs, measured: Sequence[Measured], name: str, arm: str, against: str) -> Iterator[Cells]:
-    """One pair of arms by one measure."""
+def compare(runs: Runs, known: pd.DataFrame, name: str, arm: str, against: str) -> Iterator[Cells]:
+    """Compare one pair of arms by one measure, which all of these runs have."""
     strata: list[np.ndarray] = []
     for place in runs.places:
-        mine, theirs = (values_of(measured, name, place, which) for which in (arm, against))
-        if not mine or not theirs:
+        mine, theirs = (values_of(known, name, place, which) for which in (arm, against))
+        if mine.empty or theirs.empty:
             continue
-        x, y = np.array(list(mine.values())), np.array(list(theirs.values()))
+        x, y = mine.to_numpy(), theirs.to_numpy()
         strata += [x, y]
-        shared = sorted(mine.keys() & theirs.keys())
-        difference = np.array([mine[key] - theirs[key] for key in shared])
+        difference = (mine - theirs).dropna().to_numpy()  # of the runs that share seed and number
+        shared = len(difference)
         yield (
             {"environment": place[0], "task": place[1], "measure": name, "arm": arm, "against": against}
             | {"runs": len(x), "runs_against": len(y), "difference": float(x.mean() - y.mean())}
@@ -165,7 +205,7 @@ def compare(runs: Runs, measured: Sequence[Measured], name: str, arm: str, again
             | {"improvement": float(improvement(x, y))}
             | limits("improvement", improvement, x, y)
             | {"welch_p": welch(x, y), "welch_p_holm": math.nan, "detectable": detectable(x, y)}
-            | {"pairs": len(shared), "paired_difference": float(difference.mean()) if shared else math.nan}
+            | {"pairs": shared, "paired_difference": float(difference.mean()) if shared else math.nan}
             | (limits("paired_difference", mean, difference) if shared else NO_PAIRS)
             | {"paired_p": paired(difference), "paired_p_holm": math.nan}
         )
@@ -185,15 +225,12 @@ def compare(runs: Runs, measured: Sequence[Measured], name: str, arm: str, again
         )
 
 
-def values_of(
-    measured: Sequence[Measured], name: str, place: tuple[str, str], arm: str
-) -> dict[tuple[int, int], float]:
-    """A measure of the runs that are over, by seed and number: what pairs them with another arm's."""
-    own = [m for m in measured if ((m.run.environment, m.run.task), m.run.arm) == (place, arm) and m.run.over]
-    return {(m.run.seed, m.run.number): getattr(m, name) for m in own if math.isfinite(getattr(m, name))}
+def values_of(measured: pd.DataFrame, name: str, place: Place, arm: str) -> pd.Series:
+    """A measure of an arm by seed and number of the run, which pair it with another arm's."""
+    return at(measured, place, arm).set_index(["seed", "run"])[name]
 
 
-def limits(name: str, statistic, *samples: np.ndarray) -> Cells:
+def limits(name: str, statistic: Statistic, *samples: np.ndarray) -> Cells:
     """A bootstrap interval as two cells."""
     low, high = interval(statistic, *samples)
     return {f"{name}_low": float(low), f"{name}_high": float(high)}

@@ -23,60 +23,58 @@ and each is retrained with its own seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from coim.experiments.frames import at, rows_of
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, SEED, holm
 from coim.experiments.statistics.measures import welch
 from coim.experiments.study.arms import in_order, pairs_of_arms
 from coim.experiments.study.runs import Place, Run, runs_of_folder
 
-Line = dict[str, str]
-
 TESTS = ("welch_designs_p", "welch_runs_p")
-Cells = dict[str, object]
 
 
-def by_place(rows: Sequence[Cells]) -> dict[Place, dict[str, list[Cells]]]:
+def by_place(rows: pd.DataFrame) -> dict[Place, dict[str, pd.DataFrame]]:
     """Retrained designs of each arm, in each environment and task."""
-    found: dict[Place, list[Cells]] = {}
-    for row in rows:
-        found.setdefault((str(row["environment"]), str(row["task"])), []).append(row)
-    return {
-        place: {arm: [row for row in own if row["arm"] == arm] for arm in in_order(str(row["arm"]) for row in own)}
-        for place, own in found.items()
-    }
+    places = rows[["environment", "task"]].drop_duplicates().itertuples(index=False, name=None)
+    return {place: {arm: at(rows, place, arm) for arm in in_order(at(rows, place)["arm"])} for place in places}
 
 
-def sizes(own: Sequence[Cells]) -> dict[str, int]:
+def sizes(own: pd.DataFrame) -> dict[str, int]:
     """How many designs there are, how many distinct bodies among them, and how many runs they come from."""
-    return {"designs": len(own), "bodies": len({row["xi"] for row in own}), "runs": len(by_run(own))}
+    return {"designs": len(own), "bodies": own["xi"].nunique(), "runs": len(by_run(own))}
 
 
-def by_run(own: Sequence[Cells]) -> list[np.ndarray]:
+def by_run(own: pd.DataFrame) -> list[np.ndarray]:
     """Best returns of one arm's retrained designs, those of a run together."""
-    found: dict[tuple[object, object], list[object]] = {}
-    for row in own:
-        found.setdefault((row["seed"], row["run"]), []).append(row["best_return"])
-    return [np.array(returns, dtype=float) for returns in found.values()]
+    return [rows["best_return"].to_numpy() for _, rows in own.groupby(["seed", "run"], sort=False)]
 
 
-def pairs(rows: Sequence[Cells]) -> list[Cells]:
-    """A row for each pair of arms that is compared, in each environment and task."""
-    table = [
+def pairs(rows: pd.DataFrame) -> pd.DataFrame:
+    """Compare arms.
+
+    Args:
+        rows: retrained designs, see `results`.
+
+    Returns:
+        A row for each pair of arms that is compared, in each environment and task; empty if there is none.
+    """
+    table = pd.DataFrame(
         {"environment": place[0], "task": place[1], "arm": arm, "against": against} | pair(own[arm], own[against])
         for place, own in by_place(rows).items()
         for arm, against in pairs_of_arms(list(own))
-    ]
-    for test in TESTS:
-        for row, corrected in zip(table, holm([float(str(row[test])) for row in table])):
-            row[f"{test}_holm"] = corrected
+    )
+    for test in TESTS if len(table) else ():
+        table[f"{test}_holm"] = holm(table[test])
     return table
 
 
-def pair(mine: Sequence[Cells], theirs: Sequence[Cells]) -> Cells:
+def pair(mine: pd.DataFrame, theirs: pd.DataFrame) -> dict[str, Any]:
     """Two arms in one environment and task."""
     x, y = by_run(mine), by_run(theirs)
     low, high = interval_over_runs(x, y)
@@ -113,45 +111,48 @@ def interval_over_runs(x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> tupl
     return float(low), float(high)
 
 
-def results(folder: Path, listed: Sequence[Line]) -> tuple[list[Cells], int]:
-    """Retrainings that are over.
+def results(folder: Path, listed: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """Best returns of the retrainings that are over.
 
-    One that diverged counts with the best return that it had; if it had none, with the lowest of its place.
+    One that diverged counts with the best return that it had; if it had none, with the lowest of its environment and
+    task.
+
+    Args:
+        folder: ``retrained/`` of the study.
+        listed: designs that were chosen, with the columns of `coim.experiments.study.runs.CHOSEN`.
 
     Returns:
-        A row for each, and the number of those left out: without a return, as all of their place.
+        A row for each, and the number of those left out: without a return, as all of their environment and task.
     """
-    over: list[tuple[Line, Run]] = []
-    for line in listed:
-        found = runs_of_folder(
-            folder / "cells" / line["folder"], line["environment"], line["task"], line["arm"], int(line["seed"])
-        )
-        over += [(line, run) for run in found if run.over]
-    lowest: dict[tuple[str, str], float] = {}
-    for line, run in over:
-        for row in run.designs:
-            place = line["environment"], line["task"]
-            lowest[place] = min(lowest.get(place, math.inf), row["best_return"])
     rows = [
-        result(line, run, lowest[line["environment"], line["task"]])
-        for line, run in over
-        if (line["environment"], line["task"]) in lowest
+        result(line, run)
+        for line in rows_of(listed)
+        for run in runs_of_folder(
+            folder / "cells" / line["folder"], line["environment"], line["task"], line["arm"], line["seed"]
+        )
+        if run.over
     ]
-    for own in by_place(rows).values():
-        for designs in own.values():
-            counts = {f"arm_{name}": count for name, count in sizes(designs).items()}
-            for row in designs:
-                row.update(counts)
-    return rows, len(over) - len(rows)
+    if not rows:
+        return pd.DataFrame(), 0
+    over = pd.DataFrame(rows)
+    lowest = over.groupby(["environment", "task"])["lowest_return"].transform("min")
+    over["best_return"] = over["best_return"].fillna(lowest)
+    kept = over.drop(columns="lowest_return").dropna(subset="best_return")
+    counts = [
+        pd.DataFrame(sizes(designs), index=designs.index) for own in by_place(kept).values() for designs in own.values()
+    ]
+    if not counts:
+        return kept, len(over)
+    return kept.join(pd.concat(counts).add_prefix("arm_")), len(over) - len(kept)
 
 
-def result(line: Line, run: Run, failure: float) -> Cells:
-    """A row of the CSV file; ``replaced`` is 1 where ``failure`` stands for a return that there is not."""
-    settings = run.record.settings
+def result(line: Mapping[str, Any], run: Run) -> dict[str, Any]:
+    """A row of the CSV file; ``replaced`` is 1 where another return is to stand for one that there is not."""
+    settings, returns = run.record.settings, run.designs["best_return"]
     return (
         {name: line[name] for name in ("environment", "task", "arm", "seed", "run", "design", "xi")}
-        | {"found_return": float(line["found_return"]), "best_return": float(run.best_returns(failure).max())}
-        | {"diverged": int(run.diverged), "replaced": int(not run.designs)}
+        | {"found_return": line["found_return"], "best_return": returns.max(), "lowest_return": returns.min()}
+        | {"diverged": int(run.diverged), "replaced": int(run.designs.empty)}
         | {"episodes": settings["first_episodes"], "study_episodes": settings["episodes"]}
-        | {name: int(line[name]) if line.get(name) else "" for name in ("found", "kept")}
+        | {"found": line["found"], "kept": line["kept"]}
     )

@@ -41,14 +41,11 @@ def archive(study: Path, target: Path) -> list[Path]:
         remove_run(target / name)
     for name in kept:
         copy_run(study / name, target / name, name)
-    for name in OF_STUDY:
-        if (study / name).is_file():
-            (target / name).parent.mkdir(exist_ok=True)
-            write_whole(target / name, (study / name).read_bytes())
-    for name in LEDGERS:
-        if (study / name).is_file():
-            (target / name).parent.mkdir(exist_ok=True)
-            write_whole(target / name, only({folder.name for folder in kept}, study / name))
+    for file in (*OF_STUDY, *LEDGERS):
+        if (study / file).is_file():
+            (target / file).parent.mkdir(exist_ok=True)
+            finished = {folder.name for folder in kept}
+            write_whole(target / file, only(finished, study / file) if file in LEDGERS else (study / file).read_bytes())
     return kept
 
 

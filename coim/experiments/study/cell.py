@@ -10,13 +10,13 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from coim.envs import BODIES
+from coim.experiments.frames import read_frame
 from coim.experiments.run.interrupt import ANY_NAME
 from coim.experiments.run.provenance import now
 from coim.experiments.run.resume import FREE, to_go_on
 from coim.experiments.run.settings import Settings, plain
 from coim.experiments.train import run
-from coim.run_folder import read_config
-from coim.tables import OF_RUN, read_cells
+from coim.run_folder import EVALUATIONS, read_config
 
 STARTED = "started"  # how a line of a log begins with which a try began
 # A finished run is what it is wherever it was made and is called.
@@ -72,12 +72,12 @@ def tries(log: Path) -> int:
 def episodes_done(folder: Path, num_runs: int) -> int:
     """Episodes of a cell that are in its table."""
     try:
-        return max(0, (folder / "evaluations.csv").read_bytes().count(b"\n") - 1) // num_runs
+        return max(0, (folder / EVALUATIONS.file).read_bytes().count(b"\n") - 1) // num_runs
     except OSError:
         return 0
 
 
 def seconds_of(folder: Path) -> float:
     """What a run took, by its own clock: of all the processes that computed at it; 0 if its table is not there."""
-    path = folder / "evaluations.csv"  # a shared file system may show it later
-    return max((float(row["seconds"] or 0.0) for row in read_cells(path, OF_RUN[path.name])), default=0.0)
+    rows = read_frame(folder / EVALUATIONS.file, EVALUATIONS)  # a shared file system may show it later
+    return max((seconds for seconds in rows["seconds"].tolist() if seconds > 0), default=0.0)  # NaN is not

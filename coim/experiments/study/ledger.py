@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from coim.experiments.frames import read_frame
 from coim.experiments.run.atomic_write import as_csv, write_whole
 from coim.experiments.study.definition import Cell
-from coim.tables import Layout, read_table
+from coim.tables import Layout
 
 State = Literal["waiting", "running", "finished", "failed"]
 
@@ -38,11 +38,20 @@ class Entry:
     message: str = ""
 
 
-COLUMNS = [field.name for field in dataclasses.fields(Entry)]
 LAYOUT = Layout(
-    needed=tuple(COLUMNS),
-    words=("cell", "environment", "task", "arm", "state", "message"),
-    counts=("seed", "tries"),
+    file="ledger.csv",
+    columns={
+        "cell": str,
+        "environment": str,
+        "task": str,
+        "arm": str,
+        "seed": int,
+        "state": str,
+        "tries": int,
+        "seconds": float,
+        "message": str,
+    },
+    needed=tuple(field.name for field in dataclasses.fields(Entry)),
     grows=False,
 )
 
@@ -97,7 +106,7 @@ class Ledger:
 
 def in_csv(entries: Iterable[Entry]) -> str:
     """What stands in a ``ledger.csv``."""
-    return as_csv(COLUMNS, map(vars, entries))
+    return as_csv(LAYOUT.header(), map(vars, entries))
 
 
 def read_ledger(path: Path) -> list[Entry]:
@@ -107,13 +116,8 @@ def read_ledger(path: Path) -> list[Entry]:
         ValueError: if it cannot be read as one.
     """
     try:
-        rows: list[dict[str, Any]] = read_table(path, LAYOUT)
+        rows = read_frame(path, LAYOUT)
     except ValueError as error:
         raise ValueError(f"{error}; or delete it, and what is finished is found again by its checkpoints") from None
-    return [
-        Entry(
-            **{name: row[name] for name in COLUMNS}
-            | {"seconds": None if math.isnan(row["seconds"]) else row["seconds"]}
-        )
-        for row in rows
-    ]
+    rows["seconds"] = rows["seconds"].astype("object").where(rows["seconds"].notna(), None)
+    return [Entry(*cells) for cells in rows[LAYOUT.header()].itertuples(index=False, name=None)]

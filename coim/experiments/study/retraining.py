@@ -5,23 +5,23 @@ from __future__ import annotations
 import itertools
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import tyro
 
+from coim.experiments.frames import at, designs_of, read_frame, rows_of
 from coim.experiments.run.atomic_write import as_csv, shortest, write_whole
 from coim.experiments.run.last_words import plain_sac
-from coim.experiments.run.records import Row
 from coim.experiments.run.resume import saved_settings
 from coim.experiments.study.definition import Cell
 from coim.experiments.study.runs import CHOSEN, Place, Run, Runs
-from coim.tables import read_cells
 
 RULE = {"top": 0.5, "most": 18}  # of Fig. 2
-Line = dict[str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,27 +62,44 @@ class Retraining(Cell):
         return self.folder
 
 
-def choose(runs: Runs, path: Path, asked: Retrain) -> list[Line]:
-    """Lines of ``designs.csv``: those that stand there, and those of arms that are asked for and have none there."""
-    lines: list[Line] = read_cells(path, CHOSEN)
+def choose(runs: Runs, path: Path, asked: Retrain) -> pd.DataFrame:
+    """Choose designs of arms that are asked for and have none in the file yet, and add them to it.
+
+    Args:
+        runs: of the study.
+        path: of ``retrained/designs.csv``.
+        asked: for which arms, and by which rule.
+
+    Returns:
+        All rows of the file, with the columns of `CHOSEN`.
+
+    Raises:
+        ValueError: if an arm is none of the study's, none has an optimised design, or what stands in the file was
+            chosen by another rule.
+    """
+    listed = read_frame(path, CHOSEN)
     for arm in asked.arms:
         if arm not in runs.arms:
             raise ValueError(f"{arm!r} is no arm of {asked.study}; name some of its own: --arms {' '.join(runs.arms)}")
-    rule, arms = rule_of(lines, asked), asked.arms or runs.arms
+    rule, arms = rule_of(listed, asked), asked.arms or runs.arms
+    tables = [listed]
     for place in runs.places:
-        there = {line["arm"] for line in lines if (line["environment"], line["task"]) == place}
-        lines += best_designs(runs, place, [arm for arm in arms if arm not in there], rule)
-    if not lines:
+        there = {*at(listed, place)["arm"]}
+        tables += [best_designs(runs, place, arm, rule) for arm in arms if arm not in there]
+    tables = [table for table in tables if len(table)]
+    if not tables:
         raise ValueError(f"no run of {', '.join(arms)} has an optimised design yet; let the study go on")
-    there = {(line["environment"], line["task"], line["arm"]) for line in lines}
+    chosen = pd.concat(tables, ignore_index=True)
     for place, arm in itertools.product(runs.places, arms):
-        if arm in runs.arms_at(place) and (*place, arm) not in there:
+        if arm in runs.arms_at(place) and at(chosen, place, arm).empty:
             print(f"{', '.join(place)}: no run of {arm} has an optimised design, there is nothing to retrain of it")
-    write_whole(path, as_csv(list(dict.fromkeys(key for line in lines for key in line)), lines))
-    return lines
+    noted = chosen.dropna(axis="columns", how="all")  # older studies have noted less
+    cells = noted.map(lambda value: shortest(value) if isinstance(value, float) else value, na_action="ignore")
+    write_whole(path, as_csv(list(cells.columns), rows_of(cells.fillna(""))))
+    return chosen
 
 
-def rule_of(lines: Sequence[Line], asked: Retrain) -> dict[str, float]:
+def rule_of(listed: pd.DataFrame, asked: Retrain) -> dict[str, float]:
     """``top`` and ``most``: what is asked for, or was chosen by before.
 
     Raises:
@@ -91,7 +108,7 @@ def rule_of(lines: Sequence[Line], asked: Retrain) -> dict[str, float]:
     rule: dict[str, float] = {}
     for name, usual in RULE.items():
         wanted = getattr(asked, name)
-        used = next((type(usual)(line[name]) for line in lines if line.get(name)), None)
+        used = next((type(usual)(value) for value in listed[name].dropna()), None)
         if None not in (wanted, used) and wanted != used:
             raise ValueError(
                 f"--{name} is {wanted}, but the designs in {asked.study}/retrained were chosen by {used}; leave the "
@@ -101,55 +118,56 @@ def rule_of(lines: Sequence[Line], asked: Retrain) -> dict[str, float]:
     return rule
 
 
-def best_designs(runs: Runs, place: Place, arms: Sequence[str], rule: Mapping[str, float]) -> Iterator[Line]:
-    """The best share of what each run of each arm found in one environment and task, best first.
+def best_designs(runs: Runs, place: Place, arm: str, rule: Mapping[str, float]) -> pd.DataFrame:
+    """The best share of what each run of an arm found in one environment and task, best first.
 
     Args:
         runs: of the study.
         place: environment and task.
-        arms: whose designs.
+        arm: whose designs.
         rule: ``top``, the share, and ``most``, which is divided among the runs of the arm that has most of them, so
             that all arms select alike; where it does not come out even, the first seeds give one more.
+
+    Returns:
+        A row for each design, with the columns of `CHOSEN`.
     """
     each, more = divmod(int(rule["most"]), max(runs.planned[*place, arm] for arm in runs.arms_at(place)))
     share = Fraction(str(rule["top"]))  # 7 / 25 * 25 > 7 in floating point
-    for arm in arms:
-        found = [candidates(run) for run in runs.of(place, arm)]
-        kept = [
-            pair
-            for i, own in enumerate(found)
-            for pair in own[: min(max(1, each + (i < more)), math.ceil(share * len(own)))]
-        ]
-        noted = {"over": sum(run.over for run in runs.of(place, arm)), "planned": runs.planned[*place, arm]}
-        noted |= {"found": sum(map(len, found)), "kept": len(kept), **rule}
-        for run, row in sorted(kept, key=lambda pair: -pair[1]["best_return"]):
-            yield line_of(run, row) | {name: str(value) for name, value in noted.items()}
+    own = runs.of(place, arm)
+    found = [rows for run in own if len(rows := candidates(run))]
+    if not found:
+        return pd.DataFrame(columns=CHOSEN.header())
+    kept = pd.concat(
+        rows.head(min(max(1, each + (i < more)), math.ceil(share * len(rows)))) for i, rows in enumerate(found)
+    )
+    noted = {"over": sum(run.over for run in own), "planned": runs.planned[*place, arm]}
+    noted |= {"found": sum(map(len, found)), "kept": len(kept)}
+    ranked = kept.sort_values("found_return", ascending=False, kind="stable", ignore_index=True)
+    return ranked.assign(**{name: float(value) for name, value in (noted | {**rule}).items()})
 
 
-def candidates(run: Run) -> list[tuple[Run, Row]]:
-    """Designs that Eq. 5 chose, best first."""
-    found = [(run, row) for row in run.designs if row["kind"] == "optimised"]
-    return sorted(found, key=lambda pair: -pair[1]["best_return"])
-
-
-def line_of(run: Run, row: Row) -> Line:
-    """A design and where it comes from."""
+def candidates(run: Run) -> pd.DataFrame:
+    """Designs that Eq. 5 chose, best first, and where they come from: the columns of `CHOSEN` that are needed."""
+    rows = run.designs[run.designs["kind"] == "optimised"]
+    rows = rows.sort_values("best_return", ascending=False, kind="stable")
     cell = run.record.name
-    return {
-        "folder": f"{cell}-run{run.number}-design{row['design']}",
-        "cell": cell,
-        "environment": run.environment,
-        "task": run.task,
-        "arm": run.arm,
-        "seed": str(run.seed),
-        "run": str(run.number),
-        "design": str(row["design"]),
-        "xi": " ".join(shortest(value) for value in row["xi"]),
-        "found_return": shortest(row["best_return"]),
-    }
+    return pd.DataFrame(
+        {
+            "folder": [f"{cell}-run{run.number}-design{number}" for number in rows["design"]],
+            "cell": cell,
+            "environment": run.environment,
+            "task": run.task,
+            "arm": run.arm,
+            "seed": run.seed,
+            "run": run.number,
+            "design": rows["design"].to_numpy(),
+            "xi": [" ".join(map(shortest, design)) for design in designs_of(rows)],
+            "found_return": rows["best_return"].to_numpy(),
+        }
+    )
 
 
-def cell_of(line: Line, asked: Retrain) -> Retraining:
+def cell_of(line: Mapping[str, Any], asked: Retrain) -> Retraining:
     """Plain SAC on one body: the settings of the cell that found it, less population, imagination and search."""
     settings = saved_settings(asked.study / "cells" / line["cell"])
     settings = plain_sac(

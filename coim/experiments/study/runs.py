@@ -8,22 +8,43 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from coim.experiments.run.records import Record, Row, number, read_record, read_rows
+from coim.experiments.frames import read_frame
+from coim.experiments.run.records import Record, number, read_record
 from coim.experiments.study.arms import in_order
 from coim.experiments.study.definition import from_json
 from coim.experiments.study.ledger import read_ledger
+from coim.run_folder import DESIGNS, EVALUATIONS
 from coim.tables import Layout
 
 Place = tuple[str, str]  # environment and task
 
-CHOSEN = Layout(  # what `coim.experiments.commands.retrain` has chosen to train from scratch: retrained/designs.csv
+CHOSEN = Layout(  # what ``coim retrain`` has chosen to train from scratch, in ``retrained/``
+    file="designs.csv",
+    columns={
+        "folder": str,
+        "cell": str,
+        "environment": str,
+        "task": str,
+        "arm": str,
+        "seed": int,
+        "run": int,
+        "design": int,
+        "xi": str,
+        "found_return": float,
+        "over": float,  # runs of the arm that were over, and how many there were to be
+        "planned": float,
+        "found": float,  # designs that Eq. 5 chose in all runs of the arm, and how many of them were kept
+        "kept": float,
+        "top": float,
+        "most": float,
+    },
     needed=("folder", "cell", "environment", "task", "arm", "seed", "run", "design", "xi", "found_return"),
-    words=("folder", "cell", "environment", "task", "arm", "xi"),
-    counts=("seed", "run", "design"),
     grows=False,
 )
 
@@ -57,11 +78,12 @@ class Run:
         """M, the designs it is to try."""
         return self.record.settings["num_designs"]
 
-    @property
-    def designs(self) -> list[Row]:
-        """Designs that have a best return: all episodes done, or as far as a diverged run came."""
-        rows = [row for row in self.record.designs if row["run"] == self.number and math.isfinite(row["best_return"])]
-        return [row for row in rows if row["finished"] or self.diverged]
+    @cached_property
+    def designs(self) -> pd.DataFrame:
+        """Designs that have a best return: all episodes done, or as far as a diverged run came; see `Record`."""
+        rows = self.record.designs
+        there = (rows["run"] == self.number) & np.isfinite(rows["best_return"]) & (rows["finished"] | self.diverged)
+        return rows[there].sort_values("design")
 
     @property
     def over(self) -> bool:
@@ -82,8 +104,7 @@ class Run:
         with the mean of those that held.
         """
         values = np.full(self.num_designs, failure if self.diverged else math.nan)
-        for row in self.designs:
-            values[row["design"] - 1] = row["best_return"]
+        values[self.designs["design"] - 1] = self.designs["best_return"]
         return values
 
 
@@ -126,7 +147,7 @@ class Runs:
         So that no run is behind it, whatever the sign of the rewards; NaN where no design has a return yet.
         """
         own = [run for run in self.found if (run.environment, run.task) == place]
-        return min((row["best_return"] for run in own for row in run.designs), default=math.nan)
+        return min((run.designs["best_return"].min() for run in own if len(run.designs)), default=math.nan)
 
     def in_words(self, arms: list[str], *, counted: bool = False) -> str:
         """How many of how many runs are over, and what is to be known of those that are not, or diverged.
@@ -191,10 +212,10 @@ def read_runs(study: Path) -> Runs:
         failed = ledger.get(name) == "failed"
         own = [replace(run, given_up=failed) for run in runs_of_cell(cells / name)]
         found += own
-        *which, _ = parts_of(name)
+        which = parts_of(name)[:3]
         size = own[0].record.settings["num_runs"] if own else sizes.get(name, 1)
-        planned[tuple(which)] += size
-        given_up[tuple(which)] += size * failed
+        planned[which] += size
+        given_up[which] += size * failed
     return Runs(found, planned, given_up)
 
 
@@ -211,12 +232,12 @@ def runs_of_cell(folder: Path) -> list[Run]:
 
 def runs_of_folder(folder: Path, environment: str, task: str, arm: str, seed: int) -> list[Run]:
     """Those in an ordinary run folder that have begun."""
-    if not read_rows(folder / "evaluations.csv"):
+    if read_frame(folder / EVALUATIONS.file, EVALUATIONS).empty:
         return []
     record = read_record(folder, folder.name)
-    said = [*record.episodes, *read_rows(folder / "designs.csv")]
-    diverged = {row["run"] for row in said if row.get("diverged")}
-    numbers = sorted({row["run"] for row in record.episodes})
+    said = pd.concat([record.episodes, read_frame(folder / DESIGNS.file, DESIGNS)])
+    diverged = {*said["run"][said["diverged"] != ""]}
+    numbers = sorted({*record.episodes["run"]})
     return [Run(environment, task, arm, seed, number, record, number in diverged) for number in numbers]
 
 

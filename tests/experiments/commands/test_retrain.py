@@ -12,10 +12,11 @@ from coim import HopperMorph
 from coim.experiments import train as experiment
 from coim.experiments.commands.retrain import episodes_in_words, main
 from coim.experiments.figures.write import write_figures
+from coim.experiments.frames import read_frame
 from coim.experiments.run.command_line import parse
 from coim.experiments.run.settings import Settings, plain
 from coim.experiments.study.retraining import Retrain, best_designs, cell_of, choose
-from coim.experiments.study.runs import read_runs
+from coim.experiments.study.runs import CHOSEN, read_runs
 from coim.tables import design_columns
 from tests.experiments.made_up_study import read_table, write_cell
 from tests.experiments.test_train import TINY, tiny
@@ -46,24 +47,23 @@ def study(tmp_path: Path) -> Path:
 
 def test_the_best_half_is_of_the_designs_that_eq_5_chose_in_each_run(study: Path) -> None:
     runs = read_runs(study)
-    lines = list(best_designs(runs, PLACE, ["known"], RULE))
+    lines = best_designs(runs, PLACE, "known", RULE)
     # Half of three, rounded up, of each run: not the best five of all together, of which 6 and 7 would not be.
-    assert [line["found_return"] for line in lines] == ["33", "31", "28", "20", "7", "6"]
-    assert lines[0]["folder"] == "hopper-forward-known-0-run0-design5"
-    assert lines[0]["xi"] == "1.5 1"
-    assert {(line["found"], line["kept"], line["top"], line["most"]) for line in lines} == {("9", "6", "0.5", "18")}
-    of_none = list(best_designs(runs, PLACE, ["none"], RULE))
-    assert [(line["run"], line["found_return"]) for line in of_none] == [("1", "6"), ("1", "5"), ("0", "3"), ("0", "2")]
-    assert len(list(best_designs(runs, PLACE, ["none"], {"top": 1.0, "most": 18}))) == 6
+    assert lines["found_return"].tolist() == [33, 31, 28, 20, 7, 6]
+    assert lines["folder"][0] == "hopper-forward-known-0-run0-design5"
+    assert lines["xi"][0] == "1.5 1"
+    assert lines[["found", "kept", "top", "most"]].drop_duplicates().to_numpy().tolist() == [[9, 6, 0.5, 18]]
+    of_none = best_designs(runs, PLACE, "none", RULE)
+    assert of_none[["run", "found_return"]].to_numpy().tolist() == [[1, 6], [1, 5], [0, 3], [0, 2]]
+    assert len(best_designs(runs, PLACE, "none", {"top": 1.0, "most": 18})) == 6
 
 
 def test_the_cap_is_divided_among_the_runs_alike_in_all_arms_and_at_least_one_each(study: Path) -> None:
     runs = read_runs(study)
     for most, of_none, of_known in ((3, 2, 3), (5, 4, 5), (6, 4, 6), (2, 2, 3)):  # of two runs and of three
         rule = {"top": 1.0, "most": most}
-        together = list(best_designs(runs, PLACE, ["none", "known"], rule))
-        assert [line["arm"] for line in together] == ["none"] * of_none + ["known"] * of_known
-        assert list(best_designs(runs, PLACE, ["known"], rule)) == together[-of_known:]  # whoever is chosen with it
+        assert len(best_designs(runs, PLACE, "none", rule)) == of_none
+        assert len(best_designs(runs, PLACE, "known", rule)) == of_known
 
 
 def test_a_share_of_whole_designs_is_not_rounded_up(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_a_share_of_whole_designs_is_not_rounded_up(tmp_path: Path) -> None:
         num_designs=count,
     )  # fmt: skip
     assert 7 / 25 * 25 > 7  # rounded up, it would be eight
-    assert len(list(best_designs(read_runs(tmp_path), PLACE, ["known"], {"top": 7 / 25, "most": 18}))) == 7
+    assert len(best_designs(read_runs(tmp_path), PLACE, "known", {"top": 7 / 25, "most": 18})) == 7
 
 
 def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study: Path) -> None:
@@ -81,9 +81,20 @@ def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study
     first = choose(read_runs(study), path, Retrain(study=study, arms=("known",)))
     found(study, "hopper-forward-known-7", (99, 98, 97))
     both = choose(read_runs(study), path, Retrain(study=study))
-    assert both[:6] == first
-    assert [line["arm"] for line in both[6:]] == ["none"] * 4
-    assert read_table(path) == both
+    assert both[:6].to_dict("records") == first.to_dict("records")
+    assert both["arm"][6:].tolist() == ["none"] * 4
+    assert read_frame(path, CHOSEN).to_dict("records") == both.to_dict("records")
+
+
+def test_a_list_of_an_older_study_keeps_its_columns(study: Path) -> None:
+    path = study / "chosen.csv"
+    choose(read_runs(study), path, Retrain(study=study))
+    head, *lines = path.read_text().splitlines()
+    assert head.endswith("found_return,over,planned,found,kept,top,most")
+    older = "".join(",".join(line.split(",")[:10]) + "\n" for line in [head, *lines])
+    path.write_text(older)
+    choose(read_runs(study), path, Retrain(study=study))
+    assert path.read_text() == older
 
 
 def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Path) -> None:
@@ -103,11 +114,8 @@ def test_another_rule_than_what_stands_there_was_chosen_by_is_refused(study: Pat
                 choose(runs, path, Retrain(study=study, arms=arms, **{name: value}))
     assert path.read_bytes() == before
     lines = choose(runs, path, Retrain(study=study, top=0.7))  # the same, and one that is left out
-    assert [(line["arm"], line["found"], line["kept"]) for line in lines] == [
-        *[("known", "9", "3")] * 3,
-        *[("none", "6", "2")] * 2,
-    ]
-    assert {(line["top"], line["most"]) for line in lines} == {("0.7", "3")}
+    assert lines[["arm", "found", "kept"]].to_numpy().tolist() == [*[["known", 9, 3]] * 3, *[["none", 6, 2]] * 2]
+    assert lines[["top", "most"]].drop_duplicates().to_numpy().tolist() == [[0.7, 3]]
 
 
 def settings_of(study: Path, cell: str, **values: object) -> Settings:
@@ -121,7 +129,7 @@ def settings_of(study: Path, cell: str, **values: object) -> Settings:
 def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_one_body(study: Path) -> None:
     cell = "hopper-forward-known-0"
     settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
-    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
+    lines = best_designs(read_runs(study), PLACE, "known", RULE)[1:3].to_dict("records")
     own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
     assert (own.imagine, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
     assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
@@ -173,7 +181,7 @@ def test_designs_are_retrained_once_and_drawn(
 def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None:
     for seed in (2, 0):
         settings_of(study, f"hopper-forward-known-{seed}", first_episodes=300 + seed)
-    lines = list(best_designs(read_runs(study), PLACE, ["known"], RULE))[1:3]
+    lines = best_designs(read_runs(study), PLACE, "known", RULE)[1:3].to_dict("records")
     assert episodes_in_words([cell_of(line, Retrain(study=study)) for line in lines]) == "300 or 302"
     assert episodes_in_words([cell_of(line, Retrain(study=study, episodes=9)) for line in lines]) == "9"
 

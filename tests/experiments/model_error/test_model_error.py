@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from interrupted_runs import TINY, PowerCut, no_picture
@@ -18,8 +19,9 @@ from tensordict import TensorDict
 from coim import HopperMorph, Policy
 from coim.experiments.commands.model_error import main
 from coim.experiments.figures import design_space, model_error
-from coim.experiments.model_error import algorithm as probed
+from coim.experiments.frames import read_frame
 from coim.experiments.model_error.run import probe, write_design_space
+from coim.experiments.model_error.tables import CHANGES, ERRORS
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.settings import Settings
 from tests.experiments.made_up_study import check_words
@@ -142,7 +144,7 @@ def test_each_probe_is_driven_by_the_policy_that_it_tells_of(tmp_path: Path, mon
 def test_a_fleet_has_a_row_for_each_run(tmp_path: Path) -> None:
     settings = Settings(**{**vars(TINY), "num_designs": 1, "num_runs": 2})
     list(probe(HopperMorph, settings, tmp_path, every=2, rows=4))
-    rows = read(tmp_path / probed.FILE)
+    rows = read(tmp_path / ERRORS.file)
     assert [row["run"] for row in rows] == ["0", "1"] * (len(rows) // 2)
     assert rows[0]["mse"] != rows[1]["mse"]
 
@@ -165,7 +167,7 @@ def test_a_run_of_a_fleet_that_diverges_is_measured_no_more_and_is_not_drawn(
     monkeypatch.setattr(learner, "update", spoil)
     list(measured)
     assert measured.divergence.places == {0: (0, 1)}
-    rows = read(tmp_path / probed.FILE)
+    rows = read(tmp_path / ERRORS.file)
     assert {(row["design"], row["episode"]) for row in rows if row["run"] == "0"} == {("1", "1")}
     assert {row["design"] for row in rows if row["run"] == "1"} == {"1", "2", "3"}
     write_design_space(measured, HopperMorph, tmp_path)
@@ -220,7 +222,8 @@ def test_the_figures_show_what_was_measured(study: Path) -> None:
     (errors,), (space,) = model_error.plots(study), design_space.plots(study)
     assert (errors.name, space.name) == ("figure_4a_model_error_hopper", "figure_4b_design_space_hopper")
     measured = read(study / "model_error" / "model_error.csv")
-    assert [{name: row[name] for name in measured[0]} for row in errors.rows] == measured
+    written = read_frame(study / "model_error" / ERRORS.file, ERRORS)
+    pd.testing.assert_frame_equal(pd.DataFrame(errors.rows)[list(measured[0])].astype(written.dtypes), written)
     panels = errors.figure.axes
     assert [axes.get_yscale() for axes in panels] == ["log"] * 4
     kinds = [(column, predict) for column in ("normalised", "mse") for predict in ("delta", "next")]
@@ -247,7 +250,8 @@ def is_of(row: dict[str, str], probe_name: str, predict: str) -> bool:
 def test_each_panel_of_the_design_space_has_the_colours_of_its_state_and_source_where_they_belong(study: Path) -> None:
     (space,) = design_space.plots(study)
     rows = read(study / "model_error" / "design_space.csv")
-    assert [dict(row) for row in space.rows] == rows
+    written = read_frame(study / "model_error" / CHANGES.file, CHANGES)
+    pd.testing.assert_frame_equal(pd.DataFrame(space.rows).astype(written.dtypes), written)
     states = sorted({row["state"] for row in rows})
     panels = [(state, source) for state in states for source in ("delta", "next", "simulator")]
     assert len(space.figure.axes) == len(panels) + 1  # and the scale of the colours
@@ -270,10 +274,10 @@ def test_a_measured_run_without_a_measurement_yet_is_told_not_drawn(study: Path,
     folder = tmp_path / "model_error"
     folder.mkdir()
     (folder / "config.json").write_text((study / "model_error" / "config.json").read_text())
-    (folder / probed.FILE).write_text(",".join(probed.COLUMNS) + "\n")
+    (folder / ERRORS.file).write_text(",".join(ERRORS.header()) + "\n")
     (plot,) = model_error.plots(tmp_path)
     assert plot.figure is None
-    assert f"There is no measurement yet in {folder / probed.FILE}" in plot.caption
+    assert f"There is no measurement yet in {folder / ERRORS.file}" in plot.caption
 
 
 def test_without_its_input_a_figure_says_what_to_run(tmp_path: Path) -> None:

@@ -11,15 +11,17 @@ import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from matplotlib.image import imread
 
 from coim import HalfCheetahMorph, HopperMorph
 from coim.experiments import train as experiment
 from coim.experiments.commands.report import main
-from coim.experiments.report.designs import describe_correlation, rank_correlation
+from coim.experiments.frames import designs_of
+from coim.experiments.report.designs import describe_correlation
 from coim.experiments.report.run_report import write_report
-from coim.experiments.run.records import curves, read_record, read_records
+from coim.experiments.run.records import read_record, read_records
 from tests.experiments.test_train import tiny
 
 VOID = {"meta", "img", "br"}
@@ -197,9 +199,7 @@ def test_folders_become_a_comparison(runs: Path, tmp_path: Path, capsys: pytest.
     page = check(out)
     assert page.headings[0] == "Best returns"
     assert len(page.images) == len(PICTURES)
-    best = [
-        max(row["best_return"] for row in read_record(runs / "fleet", "").designs if row["run"] == k) for k in range(3)
-    ]
+    best = read_record(runs / "fleet", "").designs.groupby("run")["best_return"].max().tolist()
     assert f"{sum(best) / 3:.4g}" in page.words
     assert f"{max(best):.4g}" in page.words
     assert "designs (differs)" not in page.words  # the mark is the style's, for eyes
@@ -246,7 +246,7 @@ def test_numbers_that_are_none_are_gaps(runs: Path, tmp_path: Path) -> None:
     page = check(write_report([folder]))
     assert "mean of 2 runs" in page.words
     best = read_record(folder, "").best
-    assert sorted(best) == [0, 2]
+    assert best.index.tolist() == [0, 2]
 
 
 def test_bodies_that_are_not_ours_are_not_drawn(runs: Path, tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_entries_of_a_design_have_the_names_of_the_columns_or_of_the_body(
         (folder / name).write_text("\n".join([head, *rows]) + "\n")
     record = read_record(folder, "")
     assert record.design_names == names
-    assert record.designs[0]["xi"] == (1, 1, 1, 1)
+    assert designs_of(record.designs)[0].tolist() == [1, 1, 1, 1]
     page = check(write_report([folder]))
     assert all(name in page.words for name in names)
     assert any(f"Scale factors over designs: {', '.join(names)}." in image["alt"] for image in page.images)
@@ -287,7 +287,7 @@ def test_the_tables_in_docs_that_count_the_entries_are_read_with_the_names_of_th
     kept = Path(__file__).parents[3] / "docs" / "results" / "preview" / "cells" / "half_cheetah-forward-none-0"
     record = read_record(kept, kept.name)
     assert record.design_names == HalfCheetahMorph.design_names()
-    assert len(record.designs[0]["xi"]) == 6
+    assert designs_of(record.designs).shape[1] == 6
 
 
 def test_names_are_words_and_neither_tags_nor_formulas(runs: Path, tmp_path: Path) -> None:
@@ -308,11 +308,11 @@ def test_what_is_no_run_gets_a_sentence(runs: Path, tmp_path: Path, capsys: pyte
     torn = shutil.copytree(runs / "one", tmp_path / "torn")
     (torn / "config.json").write_text('{"environment": ')
     cases = {
-        "nothing is no run folder: it has no config.json": [nothing],
-        "missing is no run folder": [tmp_path / "missing"],
+        "nothing holds no run: ": [nothing],
+        "missing holds no run": [tmp_path / "missing"],
         "evaluations.csv has no rows": [empty],
         "hold runs of hopper and walker; compare runs of one environment": [runs / "one", other],
-        "config.json of": [torn],
+        "config.json is damaged": [torn],
         "no folder is named": [],
     }
     for sentence, folders in cases.items():
@@ -324,32 +324,15 @@ def test_what_is_no_run_gets_a_sentence(runs: Path, tmp_path: Path, capsys: pyte
     assert not (nothing / "report.html").exists()
 
 
-def test_the_rank_correlation_is_spearmans() -> None:
-    def rows(*pairs: tuple[float, float], run: int = 0) -> list[dict]:
-        return [{"run": run, "predicted": p, "best_return": r} for p, r in pairs]
+def test_the_rank_correlation_is_told_of_each_run() -> None:
+    def rows(*pairs: tuple[float, float], run: int = 0) -> pd.DataFrame:
+        return pd.DataFrame(pairs, columns=["predicted", "best_return"]).assign(run=run)
 
     rising, falling = rows((1, 1), (2, 10), (3, 11)), rows((1, 9), (2, 3), (3, 2), run=1)
-    assert rank_correlation(rising) == pytest.approx(1.0)
-    assert rank_correlation(falling) == pytest.approx(-1.0)
-    assert rank_correlation(rows((1, 1), (2, 2), (3, 3), (4, 0))) == pytest.approx(-0.2)  # 1 - 6 * 12 / (4 * 15)
-    assert rank_correlation(rising[:2]) is None
-    assert rank_correlation(rows((1, 1), (1, 2), (1, 3))) is None
     assert describe_correlation(rising) == "Spearman's rank correlation 1.00 (n = 3 designs)"
-    assert "0.00, mean of 2 runs, from -1.00 to 1.00 (n = 3 each)" in describe_correlation(rising + falling)
-    assert describe_correlation([]) == "rank correlation not defined (n = 0 designs)"
-
-
-def test_curves_are_means_over_the_runs_and_neighbours_that_have_a_number() -> None:
-    rows = [{"run": k, "x": x, "y": float(10 * k + x)} for k in (0, 1) for x in range(5)]
-    rows[3]["y"] = float("nan")  # run 0 at 3
-    rows += [{"run": 0, "x": 5, "y": float("nan")}]
-    found = curves(rows, "x", "y")
-    assert found.x.tolist() == [0, 1, 2, 3, 4]
-    assert found.mean.tolist() == [5, 6, 7, 13, 9]
-    pairs = found.averaged(2)
-    assert pairs.x.tolist() == [0.5, 2.5, 4]
-    assert pairs.y.tolist() == [[0.5, 2, 4], [10.5, 12.5, 14]]
-    assert found.averaged(1) is found
+    both = pd.concat([rising, falling])
+    assert "0.00, mean of 2 runs, from -1.00 to 1.00 (n = 3 each)" in describe_correlation(both)
+    assert describe_correlation(rising[:0]) == "rank correlation not defined (n = 0 designs)"
 
 
 def test_long_runs_are_drawn_as_means_of_neighbouring_episodes(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:

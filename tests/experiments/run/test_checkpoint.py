@@ -15,6 +15,7 @@ from interrupted_runs import SAVES, TINY, PowerCut, cut, resume, run
 from benchmarks import soak
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.settings import Settings
+from coim.run_folder import EVALUATIONS
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,7 @@ def test_fewer_checkpoints_change_nothing_but_their_number(whole: Path, tmp_path
     folder = cut(tmp_path / "cut", 4, checkpoint_every=2)
     assert len(list(folder.glob("checkpoint/checkpoint-*"))) == 2
     resume(folder, "--checkpoint-every", "1")
-    rows = [soak.rows_without_seconds(path / "evaluations.csv") for path in (whole, folder)]
+    rows = [soak.rows_without_seconds(path, EVALUATIONS) for path in (whole, folder)]
     assert rows[0] == rows[1]
 
 

@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 import torch
 from interrupted_runs import cut, resume
@@ -17,6 +18,7 @@ from coim.experiments.drawing.film import choose
 from coim.experiments.report.run_report import write_report
 from coim.experiments.report.summary_png import draw_run
 from coim.experiments.run.records import read_record
+from coim.run_folder import DESIGNS, EVALUATIONS, METRICS
 from tests.experiments.report.test_report import check
 
 FLEET = {"num_runs": 3, "imagine": "noisy"}
@@ -64,10 +66,10 @@ def ill(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_diverged_run_has_no_rows_after_the_one_that_says_so_and_the_others_have_theirs(
     healthy: Path, ill: Path
 ) -> None:
-    for name, last in (("evaluations.csv", 3), ("metrics.csv", 3), ("designs.csv", 2)):
-        expected, rows = (soak.rows_without_seconds(folder / name) for folder in (healthy, ill))
-        assert [row for row in rows if row["run"] != "1"] == [row for row in expected if row["run"] != "1"]
-        own = [row for row in rows if row["run"] == "1"]
+    for layout, last in ((EVALUATIONS, 3), (METRICS, 3), (DESIGNS, 2)):
+        expected, rows = (soak.rows_without_seconds(folder, layout) for folder in (healthy, ill))
+        assert [row for row in rows if row["run"] != 1] == [row for row in expected if row["run"] != 1]
+        own = [row for row in rows if row["run"] == 1]
         assert [row["diverged"] for row in own] == [""] * (last - 1) + ["design 2, episode 1"]
     evaluations = [row for row in read(ill / "evaluations.csv") if row["run"] == "1"]
     assert all(torch.tensor(float(row["return"])).isfinite() for row in evaluations)
@@ -94,10 +96,10 @@ def test_a_diverged_run_is_told_and_the_page_shows_it(
 
 
 def test_what_is_left_of_a_diverged_design_is_not_a_finished_one(ill: Path) -> None:
-    designs = {(row["run"], row["design"]): row for row in read_record(ill, "").designs}
-    assert not designs[1, 2]["finished"]
-    assert designs[0, 2]["finished"]
-    assert (1, 3) not in designs
+    finished = read_record(ill, "").designs.set_index(["run", "design"])["finished"]
+    assert not finished[1, 2]
+    assert finished[0, 2]
+    assert (1, 3) not in finished.index
 
 
 def test_a_script_finds_where_a_run_diverged(ill: Path) -> None:
@@ -114,14 +116,13 @@ def test_a_design_that_a_diverged_run_never_had_is_not_offered_for_a_film(ill: P
 
 def test_the_picture_has_the_bodies_of_the_best_run(ill: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Were it the first run's, one that diverged early would leave a picture of a body or two."""
-    drawn: list[dict[str, Any]] = []
-    monkeypatch.setattr("coim.experiments.report.summary_png.draw_bodies", lambda axes, rows, body: drawn.extend(rows))
+    drawn: list[pd.DataFrame] = []
+    monkeypatch.setattr("coim.experiments.report.summary_png.draw_bodies", lambda axes, rows, body: drawn.append(rows))
     record = read_record(ill, "")
-    for row in record.designs:
-        row["best_return"] = 1.0 + row["run"]
+    record.designs["best_return"] = 1.0 + record.designs["run"]
     monkeypatch.setattr("coim.experiments.report.summary_png.read_record", lambda *_: record)
     draw_run(ill, HopperMorph)
-    assert [(row["run"], row["design"]) for row in drawn] == [(2, number) for number in (1, 2, 3, 4)]
+    assert drawn[0][["run", "design"]].to_numpy().tolist() == [[2, number] for number in (1, 2, 3, 4)]
 
 
 def test_a_run_that_was_cut_after_it_diverged_goes_on_as_the_whole_one(ill: Path, tmp_path: Path) -> None:

@@ -53,7 +53,9 @@ def test_the_table_on_the_terminal_has_the_names_of_the_body_above_its_numbers(t
 def test_a_file_whose_design_columns_are_counted_grows_on_under_its_own_header(tmp_path: Path) -> None:
     path = tmp_path / "designs.csv"
     path.write_text("run,xi_1,xi_2,best_return\n0,1,1,5\n0,2,2,6\n")
-    Table(path, ["run", "xi_torso", "xi_foot", "best_return"], keep=1).append([[0, 3.0, 3.0, 7.0]])
+    Table(path, ["run", "xi_torso", "xi_foot", "best_return"], keep=1).append(
+        [{"run": 0, "xi_torso": 3.0, "xi_foot": 3.0, "best_return": 7.0}]
+    )
     assert path.read_text() == "run,xi_1,xi_2,best_return\n0,1,1,5\n0,3,3,7\n"
     for others in (
         ["run", "xi_torso", "xi_thigh", "xi_foot", "best_return"],

@@ -19,14 +19,15 @@ from interrupted_runs import cut, resume, run
 from benchmarks import soak
 from coim import HopperMorph, load_run
 from coim.experiments.commands import model_error
+from coim.experiments.frames import designs_of
 from coim.experiments.run.checkpoint import Checkpoints, SharedRandom
 from coim.experiments.run.interrupt import Stopped, end_soon, locked, stopping_at_once
-from coim.experiments.run.records import read_rows
+from coim.experiments.run.records import read_record
 from coim.experiments.run.replay_file import ReplayFile
 from coim.experiments.run.settings import LATER
 from coim.experiments.train import main
 from coim.products import Choice
-from coim.run_folder import read_config
+from coim.run_folder import EVALUATIONS, read_config
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +99,8 @@ def test_a_run_whose_files_count_the_entries_of_a_design_goes_on_and_is_read(who
     assert (folder / "designs.csv").read_text().splitlines()[1:] == (whole / "designs.csv").read_text().splitlines()[1:]
     for older, newer in zip(load_run(folder).designs, load_run(whole).designs, strict=True):
         assert older.design.tolist() == newer.design.tolist()
-    assert [row["xi"] for row in read_rows(folder / "designs.csv")] == [
-        row["xi"] for row in read_rows(whole / "designs.csv")
-    ]
+    one, other = (designs_of(read_record(run, "").designs) for run in (folder, whole))
+    assert one.tolist() == other.tolist()
 
 
 def test_a_run_that_was_begun_before_a_setting_was_there_goes_on(tmp_path: Path, whole: Path) -> None:
@@ -275,7 +275,7 @@ def test_a_full_disk_is_one_sentence_and_the_last_checkpoint_is_good(whole: Path
         save = Checkpoints.save
 
         def save_to_a_small_disk(checkpoints: Checkpoints, notes: dict) -> None:
-            if len(soak.rows_without_seconds(folder / "evaluations.csv")) == 3:
+            if len(soak.rows_without_seconds(folder, EVALUATIONS)) == 3:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (state // 2, hard))
             save(checkpoints, notes)
 

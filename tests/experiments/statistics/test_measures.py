@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from coim.experiments.run.records import Row
+from coim.experiments.frames import spearman
 from coim.experiments.statistics.measures import (
     comparisons,
     detectable,
     measure,
+    measures,
     paired,
-    spearman,
     spearman_given,
     welch,
 )
@@ -29,14 +29,14 @@ def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> 
     write_cell(tmp_path, "hopper-forward-known-0", [10, 40, 20, 30])
     (run,) = read_runs(tmp_path).found
     found = measure(run, failure=-100)
-    assert (run.state, found.area, found.final) == ("finished", 25, 40)
-    assert found.search_gain == 20 - 30  # design 3 was searched for, design 4 drawn
+    assert (run.state, found["area"], found["final"]) == ("finished", 25, 40)
+    assert found["search_gain"] == 20 - 30  # design 3 was searched for, design 4 drawn
     # (1 - .9) Q against best return / 10 steps, of design 3, which was searched for, and 4, which was drawn
-    assert found.bias_optimised == pytest.approx(0.2 - 2)
-    assert found.bias_random == pytest.approx(0.3 - 3)
-    assert found.hours == pytest.approx(8 * 36 / 3600)
-    assert found.updates == 8 * (5 + 3 + 2)
-    assert math.isnan(found.episode_seconds)
+    assert found["bias_optimised"] == pytest.approx(0.2 - 2)
+    assert found["bias_random"] == pytest.approx(0.3 - 3)
+    assert found["hours"] == pytest.approx(8 * 36 / 3600)
+    assert found["updates"] == 8 * (5 + 3 + 2)
+    assert math.isnan(found["episode_seconds"])
 
 
 def test_the_seconds_of_an_episode_are_the_median_of_those_in_its_metrics(tmp_path: Path) -> None:
@@ -45,50 +45,48 @@ def test_the_seconds_of_an_episode_are_the_median_of_those_in_its_metrics(tmp_pa
     rows = [[*place, seconds] for place, seconds in zip(places, (90.0, 3.0, 5.0, 4.0), strict=True)]
     write_table(folder / "metrics.csv", ["run", "design", "episode", "seconds/episode"], rows)
     (run,) = read_runs(tmp_path).found
-    assert measure(run, failure=0).episode_seconds == 4.5
-
-
-def rows_of(*lines: tuple[int, float, float]) -> list[Row]:
-    return [{"design": design, "predicted": q, "best_return": best} for design, q, best in lines]
+    assert measure(run, failure=0)["episode_seconds"] == 4.5
 
 
 def test_what_only_rises_with_the_order_of_building_correlates_but_not_given_the_order() -> None:
-    learning = rows_of((6, 1.0, 20), (7, 2.0, 10), (8, 4.0, 30), (9, 3.0, 50), (10, 5.0, 40), (11, 6.0, 60))
-    q, best, order = ([row[key] for row in learning] for key in ("predicted", "best_return", "design"))
-    assert spearman(learning, "predicted", "best_return") == pytest.approx(stats.spearmanr(q, best).statistic)
+    q, best, order = [1.0, 2.0, 4.0, 3.0, 5.0, 6.0], [20, 10, 30, 50, 40, 60], [6, 7, 8, 9, 10, 11]
     # Independently: the correlation of what the order leaves of both ranks.
     ranks = [stats.rankdata(values) for values in (q, best, order)]
     left = [r - np.polyval(np.polyfit(ranks[2], r, 1), ranks[2]) for r in ranks[:2]]
-    given = spearman_given(learning, "predicted", "best_return", given="design")
+    given = spearman_given(q, best, given=order)
     assert given == pytest.approx(stats.pearsonr(*left).statistic)
-    assert given < 0 < spearman(learning, "predicted", "best_return")
+    assert given < 0 < spearman(q, best)
 
 
-def test_a_correlation_that_says_nothing_is_none() -> None:
-    rising = rows_of((6, 1.0, 10), (7, 2.0, 20), (8, 3.0, 15), (9, 4.0, 30))
-    assert math.isnan(spearman(rising[:2], "predicted", "best_return"))
-    assert math.isnan(spearman_given(rising, "predicted", "best_return", given="design"))  # Q is the order
-    assert math.isnan(spearman(rows_of((6, 1.0, 3), (7, 1.0, 4), (8, 1.0, 5)), "predicted", "best_return"))
+def test_a_correlation_given_what_determines_it_is_none() -> None:
+    assert math.isnan(spearman_given([1.0, 2.0, 3.0, 4.0], [10, 20, 15, 30], given=[6, 7, 8, 9]))  # Q is the order
 
 
 def test_first_designs_and_a_body_that_never_changes_say_nothing_of_the_ranking(tmp_path: Path) -> None:
     folder = write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], predicted=(None, 90.0, 2.0, 3.0))
     (run,) = read_runs(tmp_path).found
-    assert measure(run, failure=0).bias_random == pytest.approx(0.3 - 3)  # and Q = 90 of a first design counts nowhere
+    assert measure(run, failure=0)["bias_random"] == pytest.approx(
+        0.3 - 3
+    )  # and Q = 90 of a first design counts nowhere
     for name in ("evaluations.csv", "designs.csv"):
         rows = read_table(folder / name)
         fixed = [row | {"kind": "fixed", "xi_1": "0.5"} for row in rows]
         write_table(folder / name, list(fixed[0]), [list(row.values()) for row in fixed])
     (run,) = read_runs(tmp_path).found
     found = measure(run, failure=0)
-    for value in (found.correlation, found.correlation_given_order, found.bias_optimised, found.bias_random):
+    for value in (
+        found["correlation"],
+        found["correlation_given_order"],
+        found["bias_optimised"],
+        found["bias_random"],
+    ):
         assert math.isnan(value)
 
 
 def test_who_learns_no_model_has_no_updates_of_it(tmp_path: Path) -> None:
     write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], imagine="none")
     write_cell(tmp_path, "hopper-forward-oracle-0", [10, 40, 20, 30], dream="simulator")
-    assert [measure(run, failure=0).updates for run in read_runs(tmp_path).found] == [8 * (5 + 3)] * 2
+    assert [measure(run, failure=0)["updates"] for run in read_runs(tmp_path).found] == [8 * (5 + 3)] * 2
 
 
 def test_a_diverged_run_counts_with_the_lowest_return_of_its_place_on_what_it_did_not_reach(tmp_path: Path) -> None:
@@ -102,7 +100,7 @@ def test_a_diverged_run_counts_with_the_lowest_return_of_its_place_on_what_it_di
     assert broken.state == "diverged"
     assert broken.best_returns(failure).tolist() == [10, 40, -6, -6]
     found = measure(broken, failure)
-    assert (found.area, found.final) == (9.5, 40)  # the body that it had found before is still there
+    assert (found["area"], found["final"]) == (9.5, 40)  # the body that it had found before is still there
     assert "1 of them diverged" in runs.in_words(["known", "none"])
 
 
@@ -111,10 +109,10 @@ def test_a_run_under_way_has_no_area_yet_and_its_last_design_no_best_return(tmp_
     lines = (folder / "designs.csv").read_text().splitlines()
     (folder / "designs.csv").write_text("\n".join(lines[:-1]) + "\n")  # design 3 still has episodes to come
     (run,) = read_runs(tmp_path).found
-    assert [row["design"] for row in run.designs] == [1, 2]
+    assert run.designs["design"].tolist() == [1, 2]
     assert run.state == "under way"
-    assert math.isnan(measure(run, failure=0).area)
-    assert math.isnan(measure(run, failure=0).search_gain)
+    assert math.isnan(measure(run, failure=0)["area"])
+    assert math.isnan(measure(run, failure=0)["search_gain"])
     assert np.isnan(run.best_returns(0)).tolist() == [False, False, True, True]
 
 
@@ -220,7 +218,7 @@ def test_comparisons_pair_by_seed_correct_each_measure_by_itself_and_join_the_pl
             write_cell(tmp_path, f"hopper-{task}-none-{seed}", [theirs[seed]] * 4)
     write_cell(tmp_path, "hopper-forward-none-7", [20.0] * 4)  # has no partner
     runs = read_runs(tmp_path)
-    rows = comparisons(runs, [measure(run, failure=0) for run in runs.found])
+    rows = comparisons(runs, measures(runs)).to_dict("records")
     assert [(row["measure"], row["task"]) for row in rows] == [
         (name, task) for name in ("area", "final") for task in ("backward", "forward", "all")
     ]

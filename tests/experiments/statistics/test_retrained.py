@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
@@ -119,7 +120,7 @@ def rows_of(arm: str, *runs: Sequence[float], environment: str = "hopper") -> li
 
 def test_designs_of_one_run_are_one_sample_of_the_test_over_runs() -> None:
     mine, theirs = ([4, 5, 6], [9, 10], [6]), ([1, 2, 3], [5, 6, 7])
-    (row,) = pairs([*rows_of("none", *theirs), *rows_of("known", *mine)])
+    (row,) = pairs(pd.DataFrame([*rows_of("none", *theirs), *rows_of("known", *mine)])).to_dict("records")
     over_designs = stats.ttest_ind(np.concatenate(mine), np.concatenate(theirs), equal_var=False).pvalue
     over_runs = stats.ttest_ind([5, 9.5, 6], [2, 6], equal_var=False).pvalue
     assert (row["arm"], row["against"]) == ("known", "none")
@@ -134,7 +135,7 @@ def test_holms_correction_is_over_the_table() -> None:
     for environment, step in (("hopper", 3.0), ("walker", 1.0)):
         rows += rows_of("none", [0, 1], [2], [1], environment=environment)
         rows += rows_of("known", [step, step + 1], [step + 2], [step], environment=environment)
-    first, second = pairs(rows)
+    first, second = pairs(pd.DataFrame(rows)).to_dict("records")
     for test in ("welch_designs_p", "welch_runs_p"):
         assert first[test] < second[test]
         assert first[f"{test}_holm"] == pytest.approx(2 * first[test])

@@ -7,13 +7,12 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from coim.experiments.figures import design_space, model_error
 from coim.experiments.figures.figure import Plot
-from coim.experiments.model_error import algorithm as probed
-from coim.experiments.model_error.design_space import FILE
-from coim.experiments.model_error.tables import curves, late_share
+from coim.experiments.model_error.tables import CHANGES, ERRORS, errors, late_share
 from tests.experiments.made_up_study import check_words, write_table
 
 STEPS = (10, 20, 30, 40)
@@ -35,11 +34,11 @@ def write_measured(
     lines = []
     for i, step in enumerate(steps):
         for predict in ("delta", "next", "nothing"):
-            for run, errors in enumerate(runs):
-                if i < len(errors):
-                    error = {"delta": errors[i], "next": 1.0, "nothing": still}[predict]
+            for run, values in enumerate(runs):
+                if i < len(values):
+                    error = {"delta": values[i], "next": 1.0, "nothing": still}[predict]
                     lines.append([run, 1, i + 1, step, "seen", predict, 10 * error, error, 5, ""])
-    write_table(folder / probed.FILE, probed.COLUMNS, lines)
+    write_table(folder / ERRORS.file, ERRORS.header(), lines)
     return folder
 
 
@@ -67,8 +66,8 @@ def test_folders_and_runs_of_a_fleet_are_runs_of_one_figure_with_an_interval(tmp
     (raw,) = lines_of(plot, 2, "seen")
     assert [y for _, y in raw] == pytest.approx([30, 20, 10, 6])
     assert [(row["folder"], row["seed"], row["run"]) for row in series(plot, "run")] == [
-        ("model_error/hopper-0", 0, "0")
-    ] * 4 + [("model_error/hopper-1", 1, "0"), ("model_error/hopper-1", 1, "1")] * 4
+        ("model_error/hopper-0", 0, 0)
+    ] * 4 + [("model_error/hopper-1", 1, 0), ("model_error/hopper-1", 1, 1)] * 4
     means = series(plot, "mean")
     assert [(row["env_steps"], row["runs"]) for row in means] == [(step, 3) for step in STEPS]
     assert [row["share"] for row in means] == pytest.approx([y for _, y in mean])
@@ -122,14 +121,15 @@ def test_over_the_last_quarter_a_measurement_counts_by_how_much_moves_in_it() ->
     rows = []
     for step, error, still in ((60, 9, 9), (80, 0.003, 0.004), (100, 2, 8), (90, math.nan, math.nan)):
         for predict, value in (("delta", error), ("nothing", still)):
-            place = {"folder": "a", "run": "0", "probe": "seen", "predict": predict, "env_steps": str(step)}
-            rows.append(place | {"normalised": str(value)})
-    value, low, high = late_share(rows, "seen", "delta")
+            place = {"folder": "a", "run": 0, "probe": "seen", "predict": predict, "env_steps": step}
+            rows.append(place | {"normalised": value})
+    table = pd.DataFrame(rows)
+    value, low, high = late_share(table, "seen", "delta")
     assert value == pytest.approx(2.003 / 8.004)
     assert math.isnan(low)
     assert math.isnan(high)
-    assert curves(rows, "seen", "delta", "normalised").steps.tolist() == [60, 80, 90, 100]
-    assert math.isnan(late_share(rows, "next", "delta")[0])
+    assert errors(table, "seen", "delta", "normalised").x.tolist() == [60, 80, 100]
+    assert math.isnan(late_share(table, "next", "delta")[0])
 
 
 def write_planes(folder: Path, change: float) -> None:
@@ -140,7 +140,7 @@ def write_planes(folder: Path, change: float) -> None:
     for state in (1, 2):
         lines += [[state, "grid", x, y, change, change, change, 0] for x in (0, 1) for y in (0, 1)]
         lines.append([state, "tried", 0, 0, 0, 0, 0, 0])
-    write_table(folder / FILE, [*columns, "share_1", "share_2"], [[*line, 0.7, 0.2] for line in lines])
+    write_table(folder / CHANGES.file, [*columns, "share_1", "share_2"], [[*line, 0.7, 0.2] for line in lines])
 
 
 def test_of_several_folders_the_first_is_looked_into_and_the_others_are_named(tmp_path: Path) -> None:
