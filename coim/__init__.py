@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         select_run,
     )
     from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
+    from coim.posterior_choice import PosteriorChoice
     from coim.run_folder import TriedDesign
     from coim.saved_run import Agent, SavedRun, load_run
     from coim.updates import UpdatePlan
@@ -96,6 +97,7 @@ else:
             ],
             "objectives": ["CoImSACLoss", "DesignValue", "EnsembleNLLLoss"],
             "saved_run": ["Agent", "SavedRun", "TriedDesign", "load_run"],
+            "posterior_choice": ["PosteriorChoice"],
             "updates": ["UpdatePlan"],
         },
     )
@@ -130,6 +132,7 @@ __all__ = [
     "NoisyDesigns",
     "ParticleSwarm",
     "Policy",
+    "PosteriorChoice",
     "QValue",
     "RandomDesigns",
     "SACLearner",

@@ -19,8 +19,9 @@ from torchrl.data import Bounded
 
 from coim.agreement import check_counts, check_transfer, check_words
 from coim.buffers import Buffers
-from coim.designs import DesignSearch, RandomDesigns
+from coim.designs import DesignSearch, RandomDesigns, TrustRegion
 from coim.designs.search import Fitness
+from coim.designs.trust_region import check_reach
 from coim.envs.morph import MorphEnv
 from coim.events import DesignChosen, DesignDone, Kind, Place
 from coim.learners.sac import SACLearner
@@ -65,8 +66,8 @@ class Situation:
 class DesignChoice:
     """Algorithm 1's choice: the first designs in order, then the optimum of Eq. 5 and a random design in turn.
 
-    Another way of choosing is a subclass. `fitness` says what the search maximises, `explore` what is tried in between;
-    both may read the whole `Situation`. What they draw or learn belongs into `state_dict`.
+    Another way of choosing is a subclass. `objectives` says what the search maximises, `explore` what is tried in
+    between; both may read the whole `Situation`. What they draw or learn belongs into `state_dict`.
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``.
@@ -79,12 +80,14 @@ class DesignChoice:
             `coim.DesignValue`.
         value_over: where they come from: the ``"start"`` of episodes (the paper's), or all that were ``"visited"`` so
             far, a draw of Replay_Pop.
+        reach: search only around the body with the best return so far, this share of each entry's range to both sides,
+            in (0, 1]; None searches everywhere. See `coim.designs.TrustRegion`.
         precision: of the networks' products in Eq. 5.
         seed: seeds the random designs. It may be the algorithm's own: their numbers are independent of all others'.
 
     Raises:
-        ValueError: if a word such as ``bodies`` is unknown, ``num_start_states`` is below 1, first designs have the
-            wrong shape, dtype or device, or they or the search leave the bounds.
+        ValueError: if a word such as ``bodies`` is unknown, ``num_start_states`` is below 1, ``reach`` is not in
+            (0, 1], first designs have the wrong shape, dtype or device, or they or the search leave the bounds.
         TypeError: if the search has no method ``maximise``, or first designs are no tensor.
 
     Example:
@@ -105,6 +108,7 @@ class DesignChoice:
         num_start_states: int = 36,
         value_states: StatesAre = "stored",
         value_over: Literal["start", "visited"] = "start",
+        reach: float | None = None,
         precision: Literal["float32", "bfloat16"] = "float32",
         seed: int = 0,
     ) -> None:
@@ -118,22 +122,43 @@ class DesignChoice:
         _check_first_designs(spec, first_designs)
         if bodies == "search" or search is not None:
             _check_search(spec, search)
+        if reach is not None:
+            check_reach(reach)
         self.spec, self.first_designs, self.search, self.bodies = spec, first_designs, search, bodies
         self.num_start_states, self.value_states, self.value_over = num_start_states, value_states, value_over
-        self.precision = precision
+        self.precision, self.reach = precision, reach
         # On the CPU wherever the networks are: there the same seed gives the same bodies.
         self.rng = stream("designs", seed)
 
     def choose(self, situation: Situation) -> DesignChosen:
         """Choose the next body of every run; one that has diverged keeps the body that it has."""
-        kind, design, predicted = self._next(situation)
+        # One draw of states for the choice and for what is predicted. Before the first episode there is none.
+        values = self.fitness(situation) if len(situation.buffers.s0) > 0 else []
+        objectives = self.objectives(situation, values)
+        kind, predicted = self._kind(situation.index), None
+        if kind == "optimised":
+            found = [self.maximise(situation, run, objective) for run, objective in enumerate(objectives)]
+            design = torch.stack([design for design, _ in found])
+            if objectives is values:
+                predicted = torch.tensor([value for _, value in found], dtype=torch.float32, device="cpu")
+        elif kind == "random":
+            design = self.explore(situation)
+        else:
+            index = 0 if kind == "fixed" else situation.index
+            design = self.first_designs[index].expand(situation.num_runs, -1)
+        if predicted is None and values:
+            each = [value(row.unsqueeze(0))[0] for value, row in zip(values, design)]
+            predicted = torch.stack(each).cpu()
+        expected = self.expect(objectives, design)
         if frozen := [*situation.diverged]:
             design = design.clone()
             design[frozen] = situation.present[frozen].to(design.device)
-            if predicted is not None:
-                predicted = predicted.clone()
-                predicted[frozen] = torch.nan
-        return DesignChosen(situation.index, kind, design, predicted, dict(situation.diverged))
+            predicted = None if predicted is None else _without(predicted, frozen)
+            expected = None if expected is None else (_without(expected[0], frozen), _without(expected[1], frozen))
+        mean, deviation = expected or (None, None)
+        return DesignChosen(
+            situation.index, kind, design, predicted, dict(situation.diverged), expected=mean, deviation=deviation
+        )
 
     def fitness(self, situation: Situation) -> list[Fitness]:
         """Eq. 5 of each run, ``K`` of them, over the same draw of states.
@@ -154,6 +179,26 @@ class DesignChoice:
             else _flat_fitness
             for k in range(situation.num_runs)
         ]
+
+    def objectives(self, situation: Situation, values: list[Fitness]) -> list[Fitness]:
+        """What the search maximises for each run: Eq. 5, ``values``, as `fitness` has given it."""
+        return values
+
+    def maximise(self, situation: Situation, run: int, objective: Fitness) -> tuple[Tensor, float]:
+        """Search the next body of one run: the design ``[D]`` and what the objective says of it."""
+        assert self.search is not None
+        if self.reach is None or run in situation.diverged:
+            return self.search.maximise(objective)
+        returns = torch.stack([done.best_return[run] for done in situation.tried]).nan_to_num(nan=-torch.inf)
+        best = situation.tried[int(returns.argmax())].design[run]
+        return TrustRegion(self.spec, self.search, reach=self.reach).maximise(objective, centre=best)
+
+    def expect(self, objectives: list[Fitness], design: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Mean and deviation of the best return that is expected of designs ``[K, D]``, each ``[K]`` on the CPU.
+
+        Eq. 5 is no return: None.
+        """
+        return None
 
     def explore(self, situation: Situation) -> Tensor:
         """Uniform designs, ``[K, D]``: the exploration step of Algorithm 1."""
@@ -183,29 +228,20 @@ class DesignChoice:
         if load is not None and state_dict["search"] is not None:
             load(state_dict["search"])
 
-    def _next(self, situation: Situation) -> tuple[Kind, Tensor, Tensor | None]:
-        """The kind of the design, the designs ``[K, D]`` and what is predicted of them, ``[K]``."""
-        since = situation.index - len(self.first_designs)
-        if self.bodies == "search" and since >= 0 and since % 2 == 0:
-            assert self.search is not None
-            found = [self.search.maximise(fitness) for fitness in self.fitness(situation)]
-            values = torch.tensor([value for _, value in found], dtype=torch.float32, device="cpu")
-            return "optimised", torch.stack([design for design, _ in found]), values
-        kind: Kind
+    def _kind(self, index: int) -> Kind:
         if self.bodies == "fixed":
-            kind, design = "fixed", self.first_designs[0].expand(situation.num_runs, -1)
-        elif since < 0:
-            kind, design = "first", self.first_designs[situation.index].expand(situation.num_runs, -1)
-        else:
-            kind, design = "random", self.explore(situation)
-        return kind, design, self._predict(situation, design)
+            return "fixed"
+        since = index - len(self.first_designs)
+        if since < 0:
+            return "first"
+        return "optimised" if self.bodies == "search" and since % 2 == 0 else "random"
 
-    def _predict(self, situation: Situation, design: Tensor) -> Tensor | None:
-        """The fitness of designs ``[K, D]`` that were not searched for, ``[K]``; None before there is a start state."""
-        if len(situation.buffers.s0) == 0:
-            return None
-        values = [fitness(row.unsqueeze(0))[0] for fitness, row in zip(self.fitness(situation), design)]
-        return torch.stack(values).cpu()
+
+def _without(numbers: Tensor, frozen: list[int]) -> Tensor:
+    """A copy of ``[K]`` in which these runs have NaN."""
+    numbers = numbers.clone()
+    numbers[frozen] = torch.nan
+    return numbers
 
 
 def _flat_fitness(designs: Tensor) -> Tensor:

@@ -27,6 +27,8 @@ class DesignChosen:
         predicted: Eq. 5 at this design before anything is learnt on it, ``[K]``; None while there is no start state.
         diverged: runs that have diverged, and where (see `coim.learners.divergence`). They keep the body that they
             have, and their numbers here and in all later events are NaN.
+        expected: best return that is expected of this design, ``[K]``; None where a choice expects none.
+        deviation: of the best return around ``expected``, noise of a run included, ``[K]``.
     """
 
     index: int
@@ -34,6 +36,8 @@ class DesignChosen:
     design: Tensor
     predicted: Tensor | None
     diverged: Mapping[int, Place] = field(default_factory=dict)
+    expected: Tensor | None = None
+    deviation: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,7 @@ class TrustRegion:
     """
 
     def __init__(self, spec: Bounded, search: DesignSearch, *, reach: float = 0.25) -> None:
-        if not 0 < reach <= 1:
-            raise ValueError(f"reach is {reach}, it must be in (0, 1]: a share of the range of each entry")
+        check_reach(reach)
         self._low, self._high = bounds_of(spec)
         self.search, self.reach = search, reach
 
@@ -68,3 +67,9 @@ class TrustRegion:
 
         found, value = self.search.maximise(lambda designs: fitness(moved(designs)))
         return moved(found), value
+
+
+def check_reach(reach: float) -> None:
+    """Refuse a box that is empty or longer than the design space."""
+    if not 0 < reach <= 1:
+        raise ValueError(f"reach is {reach}, it must be in (0, 1]: a share of the range of each entry")

@@ -1,0 +1,105 @@
+"""The next body by a Gaussian process over the returns of those that were tried."""
+
+from __future__ import annotations
+
+import io
+from itertools import islice
+from typing import Any
+
+import pytest
+import torch
+from small_algorithm import small
+
+from coim import CoAdaptation, DesignChosen, DesignDone, Event, GradientSearch, HopperMorph, ParticleSwarm
+from coim.designs import DesignPosterior
+from coim.posterior_choice import PosteriorChoice
+
+SPEC = HopperMorph(seed=0).design_spec
+FIRST = torch.tensor(HopperMorph.FIRST_DESIGNS[:3])
+
+
+def choosing(num_runs: int = 1, *, designs: int = 7, **settings: Any) -> CoAdaptation:
+    search = GradientSearch(SPEC, num_starts=16, num_steps=20, seed=0)
+    choice = PosteriorChoice(SPEC, FIRST, search=search, num_start_states=4, seed=0, **settings)
+    return small(num_runs, imagine=False, design_choice=choice, num_designs=designs, first_episodes=1)
+
+
+def chosen_of(events: list[Event]) -> list[DesignChosen]:
+    return [event for event in events if isinstance(event, DesignChosen)]
+
+
+@pytest.mark.parametrize("critic", [True, False])
+@pytest.mark.parametrize("num_runs", [1, 2])
+def test_each_run_maximises_the_posterior_of_its_own_bodies(num_runs: int, critic: bool) -> None:
+    events = list(choosing(num_runs, critic=critic))
+    done = [event for event in events if isinstance(event, DesignDone)]
+    for event in chosen_of(events)[4:]:  # from the fourth body on there are three returns
+        assert event.expected is not None
+        assert event.deviation is not None
+        assert event.expected.shape == event.deviation.shape == (num_runs,)
+        assert event.predicted is not None  # Eq. 5, as for all other choices
+        for run in range(num_runs):
+            designs = torch.stack([before.design[run] for before in done[: event.index]])
+            returns = torch.stack([before.best_return[run] for before in done[: event.index]])
+            if not critic:  # Eq. 5 would have to be asked again over the same states
+                posterior = DesignPosterior(SPEC, designs, returns)
+                mean, deviation = posterior.predict(event.design[run : run + 1])
+                torch.testing.assert_close(event.expected[run], mean[0])
+                torch.testing.assert_close(event.deviation[run], deviation[0])
+                if event.kind == "optimised":
+                    others = torch.rand(200, 4) * 1.5 + 0.5
+                    assert posterior(event.design[run : run + 1]) >= posterior(others).max() - 1.0
+
+
+def test_before_three_returns_are_known_eq_5_is_maximised_as_without_it() -> None:
+    first = FIRST[:1]
+    searches = [ParticleSwarm(SPEC, num_particles=9, num_iterations=3, seed=0) for _ in range(2)]
+    choice = PosteriorChoice(SPEC, first, search=searches[0], num_start_states=4, seed=0)
+    with_it = chosen_of(list(small(1, imagine=False, design_choice=choice, num_designs=3)))
+    without = chosen_of(
+        list(small(1, imagine=False, search=searches[1], first_designs=first, num_start_states=4, num_designs=3))
+    )
+    for one, other in zip(with_it, without):
+        assert (one.kind, one.expected) == (other.kind, None)
+        assert torch.equal(one.design, other.design)
+
+
+def test_it_resumes_to_the_last_bit() -> None:
+    expected, stop = list(choosing(2)), 11
+    first, second = choosing(2), choosing(2)
+    list(islice(first, stop))
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    gone_on = chosen_of(list(second))
+    assert gone_on
+    for one, other in zip(gone_on, chosen_of(expected[stop:])):
+        assert torch.equal(one.design, other.design)
+        assert one.expected is not None
+        assert other.expected is not None
+        assert torch.equal(one.expected, other.expected)
+
+
+def test_a_run_that_has_diverged_expects_nothing() -> None:
+    algorithm = choosing(2, designs=6)
+    for event in algorithm:
+        if isinstance(event, DesignDone) and event.index == 3:
+            algorithm.divergence.places[1] = (3, 0)
+        if isinstance(event, DesignChosen) and event.index == 4:
+            assert event.expected is not None
+            assert event.deviation is not None
+            assert event.expected.isnan().tolist() == event.deviation.isnan().tolist() == [False, True]
+
+
+def test_a_reach_keeps_the_search_around_the_best_body() -> None:
+    algorithm = choosing(1, reach=0.1)
+    events = list(algorithm)
+    done = {event.index: event for event in events if isinstance(event, DesignDone)}
+    searched = [event for event in chosen_of(events) if event.kind == "optimised"]
+    assert searched
+    for event in searched:
+        best = max((done[index] for index in range(event.index)), key=lambda before: before.best_return[0].item())
+        assert (event.design - best.design).abs().max() <= 0.1 * 1.5 + 1e-6
+    with pytest.raises(ValueError, match=r"reach is 0, it must be in \(0, 1\]"):
+        PosteriorChoice(SPEC, FIRST, search=GradientSearch(SPEC, seed=0), reach=0)
