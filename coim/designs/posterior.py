@@ -46,7 +46,8 @@ except ImportError as error:
     ) from error
 
 # Medians of the priors, and the deviation of the logarithm of each. Designs are in the unit cube, returns have
-# deviation 1. Few bodies say little about them: the priors decide. Chosen on simulated studies.
+# deviation 1. Few bodies say little about them: the priors decide, and docs/results/choosing.md
+# has what others would have gained on simulated studies.
 LENGTH = 0.8
 SIGNAL = 1.0
 NOISE = 0.9
