@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -53,6 +54,17 @@ def usage() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name:{width}}  {what}" for name, what in COMMANDS.items()]
     return "\n".join(["usage: coim WORD ...", "", *lines, "", "coim WORD --help lists what each of them takes."])
+
+
+def as_help(docstring: str | None) -> str:
+    """A docstring without the markup of its source, as the description of a command.
+
+    Example:
+        >>> as_help("Draw a study: ``coim figures FOLDER``.")
+        'Draw a study: coim figures FOLDER.'
+    """
+    linked = re.sub(r"`([^`<]+) <([^>]+)>`_", r"\1 (\2)", docstring or "")
+    return re.sub(r"(:\w+:)?`+", "", linked)
 
 
 def mind_ctrl_c() -> None:

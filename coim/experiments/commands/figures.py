@@ -14,6 +14,7 @@ from pathlib import Path
 
 import tyro
 
+from coim.experiments.command import as_help
 from coim.experiments.figures.write import write_figures
 from coim.experiments.run.interrupt import on_command_line
 
@@ -30,7 +31,7 @@ class Figures:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    asked = tyro.cli(Figures, prog="coim figures", description=__doc__, args=arguments)
+    asked = tyro.cli(Figures, prog="coim figures", description=as_help(__doc__), args=arguments)
     with on_command_line(own_process=arguments is None):
         for plot in write_figures(asked.study, asked.out):
             place = (asked.out or asked.study / "figures") / plot.name

@@ -1,7 +1,7 @@
-"""Fig. 4(a) and (b): how well the learnt dynamics know bodies, over the training of one run.
+"""Measure the error of the learnt dynamics during the training of one run, for Fig. 4(a) and (b).
 
-``coim model-error ENVIRONMENT --out STUDY_FOLDER/model_error`` follows Algorithm 1 as the environment's
-own recipe does and measures on the way; the same line again goes on with a run that was stopped.
+``coim model-error ENVIRONMENT --out STUDY_FOLDER/model_error`` follows Algorithm 1 as ``coim run ENVIRONMENT`` does,
+and measures on the way. The same line again goes on with a run that was stopped.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from coim.envs import BODIES
+from coim.experiments.command import as_help
 from coim.experiments.model_error.run import run
 from coim.experiments.run.command_line import parse
 from coim.experiments.run.interrupt import on_command_line
@@ -20,7 +21,8 @@ from coim.experiments.run.interrupt import on_command_line
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line: the environment, two options of its own, and every setting of the environment's recipe."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    own = argparse.ArgumentParser(prog="coim model-error", description=__doc__, add_help=False, allow_abbrev=False)
+    about = as_help(__doc__)
+    own = argparse.ArgumentParser(prog="coim model-error", description=about, add_help=False, allow_abbrev=False)
     own.add_argument("environment", choices=BODIES)
     own.add_argument("--every", type=int, default=10, help="episodes of a design between two measurements (10)")
     own.add_argument("--rows", type=int, default=200, help="transitions in each measurement (200)")
@@ -36,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 raise ValueError(f"--{name} is {getattr(asked, name)}, it must be at least 1")
         words = [*folder_options(asked.out), *rest]
         # States are swapped by noisy designs too, whatever the run imagines.
-        settings = parse(f"{own.prog} {asked.environment}", str(__doc__), words, read=("sigma",))
+        settings = parse(f"{own.prog} {asked.environment}", about, words, read=("sigma",))
         run(BODIES[asked.environment], asked.environment, settings, every=asked.every, rows=asked.rows)
 
 

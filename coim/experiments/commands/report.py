@@ -1,4 +1,4 @@
-"""What became of a run, on one page: ``coim report runs/A``, or ``runs/A runs/B`` for a comparison.
+"""Write the page of a run: ``coim report runs/A``, or ``runs/A runs/B`` for a comparison.
 
 The page opens from a file, without a network. A run that is still going on can be looked at too.
 """

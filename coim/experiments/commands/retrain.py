@@ -1,15 +1,14 @@
-"""Fig. 2: the best designs that each arm found, retrained from scratch: ``coim retrain STUDY_FOLDER``.
+"""Retrain the best designs that each arm found from scratch, for Fig. 2: ``coim retrain STUDY_FOLDER``.
 
-What an arm found are the designs that it chose by Eq. 5 (kind "optimised"): the first designs are given to every arm,
-and the random ones are nobody's merit. The best half of those of each run, by the best return in the study, is trained
-anew with plain SAC: Algorithm 1 with this one design, no population and nothing imagined. Of each run, and not of all
-runs of an arm together: the few best of all come from few runs, and a test of arms takes their luck for the arm's (see
-`coim.experiments.statistics.retrained`).
+An arm has found the designs that it chose by Eq. 5 (kind "optimised"). The first designs are given to every arm, and
+the random ones are no merit of an arm. From each run, the best half of these designs, by their best return in the
+study, is trained with plain SAC: Algorithm 1 with this one design, no population and nothing imagined. The best half
+of all runs together would come from few runs, and a test of arms would take the luck of these runs for the arm's merit.
 
-``retrained/designs.csv`` in the study's folder names what was chosen; what stands there is not chosen again when the
-study grows, and says how many of the arm's runs were over by then, and how many of how many designs were kept. Beside
-it are a ledger and ``cells/`` with an ordinary run folder for each. Run it again and it goes on: what is finished is
-skipped, what was stopped is resumed from its checkpoint.
+``retrained/designs.csv`` in the study's folder names the designs. They are not chosen again when the study grows. The
+file also has the number of the arm's runs that were over at that time, and how many of their designs were kept. Beside
+it are a ledger and ``cells/`` with an ordinary run folder for each design. The same command goes on: finished designs
+are skipped, stopped ones are resumed from their checkpoint.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from coim.experiments.command import as_help
 from coim.experiments.frames import rows_of
 from coim.experiments.run.interrupt import locked, on_command_line, stopping_at_once
 from coim.experiments.run.machine import available_cores
@@ -32,7 +32,7 @@ DEFAULT = ", as the study gave to a first design (the paper: 300); --episodes ta
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line; ends with 1 if a design could not be trained."""
-    asked = tyro.cli(Retrain, prog="coim retrain", description=__doc__, args=arguments)
+    asked = tyro.cli(Retrain, prog="coim retrain", description=as_help(__doc__), args=arguments)
     with on_command_line(own_process=arguments is None, again="the same command goes on"):
         failed = retrain(asked)
     if failed:
@@ -88,5 +88,5 @@ def check(asked: Retrain) -> None:
 
 
 def episodes_in_words(cells: Sequence[Retraining]) -> str:
-    """Of the designs, which differ where the environments of a study do."""
+    """Training episodes of the designs, which differ where the environments of a study do."""
     return " or ".join(str(count) for count in sorted({cell.settings.first_episodes for cell in cells}))

@@ -1,8 +1,8 @@
-"""Many runs that are compared: ``coim study preview``.
+"""Compute many runs that are compared: ``coim study preview``.
 
-A study is a name of `coim.experiments.study.named`, or a JSON file with the fields of
-`coim.experiments.study.definition.Study`. Its folder has ``study.json``, ``ledger.csv`` with a row for each cell,
-``cells/`` with an ordinary run folder for each, and ``logs/``. The same command goes on with what is not finished.
+A study has a name, or is a JSON file with these fields: name, environments, arms, seeds, tasks, protocol, overrides,
+seeds_per_cell, blocks. Its folder has ``study.json``, ``ledger.csv`` with a row for each cell, ``cells/`` with an
+ordinary run folder for each, and ``logs/``. The same command goes on with the cells that are not finished.
 `Ray <https://docs.ray.io>`_ computes the cells, on this machine or, with ``--ray-address``, on a cluster whose nodes
 see the folder under the same name and have the same version of coim.
 """
@@ -15,9 +15,11 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from coim.experiments.command import as_help
 from coim.experiments.run.atomic_write import write_whole
 from coim.experiments.run.interrupt import locked, on_command_line, stopping_at_once
 from coim.experiments.run.machine import available_cores, checked_device
@@ -32,8 +34,7 @@ from coim.experiments.study.ray_scheduler import RETRIES, Conductor, Resources, 
 class Options:
     """Make the runs of a study, or go on with them."""
 
-    study: tyro.conf.Positional[str]
-    """Name of a study, or a JSON file with the fields of one."""
+    study: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help=f"{', '.join(STUDIES)}, or a JSON file.")]
     out: Path | None = None
     """Folder of the study; by default runs/study-NAME."""
     workers: int = 0
@@ -135,6 +136,6 @@ def command(options: Options) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    options = tyro.cli(Options, prog="coim study", description=__doc__, args=arguments)
+    options = tyro.cli(Options, prog="coim study", description=as_help(__doc__), args=arguments)
     with on_command_line(own_process=arguments is None, again=f"to go on: {command(options)}"):
         conduct(options)

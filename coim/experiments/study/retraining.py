@@ -31,7 +31,7 @@ class Retrain:
     study: tyro.conf.Positional[Path]
     """Folder of the study."""
     arms: tuple[str, ...] = ()
-    """Whose designs; by default those of all arms of the study that search for them (Fig. 2 has none and known)."""
+    """Arms of the study whose designs are retrained; by default all that search for designs (Fig. 2: none, known)."""
     top: float | None = None
     """Share of each run's optimised designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
     most: int | None = None
@@ -58,7 +58,7 @@ class Retraining(Cell):
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         return self.folder
 
 
