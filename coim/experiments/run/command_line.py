@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import tyro
+from pydantic import ValidationError
 
 from coim.experiments.run.effect import refuse_without_effect
+from coim.experiments.run.pydantic_errors import sentence
 from coim.experiments.run.resume import refuse_changes, saved_settings
-from coim.experiments.run.settings import PRESETS, Settings, check, given, option
+from coim.experiments.run.settings import PRESETS, Settings, given, option
 from coim.run_folder import RENAMED
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Written(Settings):
+    """Settings as they are written on a command line: not validated, so that an error can name the option."""
+
+    def __post_init__(self) -> None:
+        pass
 
 
 def parse(
@@ -31,19 +42,21 @@ def parse(
         ValueError: if the folder to resume holds no run, or a setting was changed that its past depends on.
     """
     arguments = renamed(sys.argv[1:] if arguments is None else arguments)
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first = argparse.ArgumentParser(prog=program, usage="%(prog)s [OPTIONS]", add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="paper")
     first.add_argument("--resume", type=Path)
     known = first.parse_known_args(arguments)[0]
     default = PRESETS.get(known.preset, PRESETS["paper"])  # an unknown name is refused below, with those that exist
     if known.resume is not None:
         default = saved_settings(known.resume)
-    settings = tyro.cli(Settings, prog=program, description=description, args=arguments, default=default)
+    default = Written(**vars(default))
+    written = tyro.cli(Written, prog=program, description=description, args=arguments, default=default)
     try:
-        check(settings, called=option)
+        settings = Settings(**vars(written))
         refuse_without_effect(settings, given(arguments), called=option, read=read)
     except ValueError as error:
-        first.error(str(error))
+        refused = error.__cause__
+        first.error(sentence(refused, Settings, called=option) if isinstance(refused, ValidationError) else str(error))
     if known.resume is not None:
         refuse_changes(default, settings)
     return settings

@@ -91,6 +91,7 @@ def on_command_line(*, own_process: bool, also: tuple[type[Exception], ...] = ()
     """
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors=ANY_NAME)
+    expected: tuple[type[Exception], ...] = (ValueError, OSError, *also)
     try:
         with stopping_at_once():
             yield
@@ -99,7 +100,7 @@ def on_command_line(*, own_process: bool, also: tuple[type[Exception], ...] = ()
         if own_process:
             end_soon(stop.signum)
         sys.exit(128 + stop.signum)
-    except (ValueError, OSError, *also) as error:
+    except expected as error:
         sys.exit(sentence_of(error))
     except SystemExit as leaving:
         if own_process and isinstance(leaving.__context__, Stopped):

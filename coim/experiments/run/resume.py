@@ -122,8 +122,8 @@ def saved_settings(folder: Path) -> Settings:
             f"{folder} was made by a version with other settings: {', '.join(other)}; go on with the version in its "
             "config.json"
         )
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in saved.items()}
-    return Settings(**values | {"out": Path(saved["out"]) if saved["out"] else None})
+    values: dict[str, Any] = saved | {"out": Path(saved["out"]) if saved["out"] else None}
+    return Settings(**values)
 
 
 def changes(old: Settings, new: Settings) -> dict[str, list[Any]]:

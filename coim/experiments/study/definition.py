@@ -6,15 +6,18 @@ import dataclasses
 import itertools
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError, ValidationInfo
+from pydantic.dataclasses import dataclass
 
 from coim.envs import BODIES
 from coim.experiments.run.effect import without_effect
-from coim.experiments.run.settings import LIMITS, PRESETS, Settings, check
-from coim.experiments.run.validation import Interval, fitted, kinds_of, refuse_outside
-from coim.experiments.study.arms import ARMS
+from coim.experiments.run.pydantic_errors import CONFIG, refused_in_words, sentence
+from coim.experiments.run.settings import FIELDS, LISTS, PRESETS, Amount, Count, Settings, Task
+from coim.experiments.study.arms import ARMS, arm_named
 
 PAPER = PRESETS["paper"]
 Protocol = Literal["paper", "preview", "smoke"]
@@ -49,44 +52,60 @@ OF_THE_CELL = {"preset", "task", "imagine", "bodies", "dream", "seed", "num_runs
 OF_THE_CELL |= {"out", "resume", "name", "quiet"}
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+Value = TypeVar("Value")
+
+
+def each_once(values: tuple[Value, ...], field: ValidationInfo) -> tuple[Value, ...]:
+    """Refuse a value that comes twice."""
+    if twice := sorted({repr(value) for value in values if values.count(value) > 1}):
+        raise ValueError(f"{field.field_name} has {', '.join(twice)} more than once; name each of them once")
+    return values
+
+
+def known_body(name: str) -> str:
+    """Refuse the name of no body."""
+    if name not in BODIES:
+        raise ValueError(f"{name!r} is no environment; there are {', '.join(BODIES)}")
+    return name
+
+
+def known_arm(name: str) -> str:
+    """Refuse the name of no arm."""
+    return arm_named(name).name
+
+
+def of_a_study(overrides: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Refuse a setting that no study can set."""
+    if other := sorted(overrides.keys() - (FIELDS - OF_THE_CELL)):
+        raise ValueError(
+            f"overrides of {', '.join(other)} are not possible; a study may set "
+            f"{', '.join(sorted(FIELDS - OF_THE_CELL))}"
+        )
+    return overrides
+
+
+SOME = (LISTS, Field(min_length=1), AfterValidator(each_once))
+
+
+@refused_in_words
+@dataclass(frozen=True, kw_only=True, config=CONFIG)
 class Block:
     """Every combination of what is listed here."""
 
-    environments: tuple[str, ...]
-    """Of half_cheetah, hopper, walker."""
-    arms: tuple[str, ...]
+    environments: Annotated[tuple[Annotated[str, AfterValidator(known_body)], ...], *SOME]
+    """Names of bodies."""
+    arms: Annotated[tuple[Annotated[str, AfterValidator(known_arm)], ...], *SOME]
     """Names of arms, as `coim.experiments.study.arms.ARMS` has them."""
-    seeds: tuple[int, ...]
+    seeds: Annotated[tuple[Amount, ...], *SOME]
     """Shared by all arms, which makes every comparison one of pairs."""
-    tasks: tuple[str, ...] = ("forward",)
-    """Of forward, backward."""
-    overrides: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    tasks: Annotated[tuple[Task, ...], *SOME] = ("forward",)
+    """Directions in which the speed in the reward counts."""
+    overrides: Annotated[Mapping[str, Any], AfterValidator(of_a_study)] = dataclasses.field(default_factory=dict)
     """Settings that differ from the protocol's; those of a study hold in all of its blocks."""
 
-    def __post_init__(self) -> None:
-        for name, kind in kinds_of(type(self)).items():
-            fitted(name, getattr(self, name), kind)
-        for name in ("environments", "tasks", "arms", "seeds"):
-            if not (values := getattr(self, name)):
-                raise ValueError(f"{name} is empty, and nothing is to be computed then; name at least one of them")
-            if twice := sorted({value for value in values if values.count(value) > 1}):
-                raise ValueError(f"{name} has {', '.join(map(repr, twice))} more than once; name each of them once")
-        refuse_outside("seeds", tuple(self.seeds), LIMITS["seed"])
-        known: dict[str, Collection[str]] = {"environments": BODIES, "arms": ARMS, "tasks": ("forward", "backward")}
-        for name, choices in known.items():
-            for value in getattr(self, name):
-                if value not in choices:
-                    raise ValueError(f"{value!r} is none of the {name} that there are: {', '.join(choices)}")
-        fields = {field.name for field in dataclasses.fields(Settings)}
-        if other := sorted(self.overrides.keys() - (fields - OF_THE_CELL)):
-            raise ValueError(
-                f"overrides of {', '.join(other)} are not possible; a study may set "
-                f"{', '.join(sorted(fields - OF_THE_CELL))}"
-            )
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@refused_in_words
+@dataclass(frozen=True, kw_only=True, config=CONFIG)
 class Study(Block):
     """A block, and more of them where not everything is combined with everything.
 
@@ -104,14 +123,12 @@ class Study(Block):
     """Of its folder, where none is given."""
     protocol: Protocol = "paper"
     """paper: Sec. 6.1. preview: the same networks and updates with fewer designs and episodes. smoke: seconds."""
-    seeds_per_cell: int = 1
+    seeds_per_cell: Count = 1
     """Seeds that one cell advances in lock-step along the run axis, seeded by the first of them: for a GPU."""
-    blocks: tuple[Block, ...] = ()
+    blocks: Annotated[tuple[Block, ...], LISTS] = ()
     """More combinations."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        refuse_outside("seeds_per_cell", self.seeds_per_cell, Interval(1))
         names = [
             "-".join(map(str, place))
             for block in (self, *self.blocks)
@@ -120,7 +137,6 @@ class Study(Block):
         if twice := sorted(name for name, times in Counter(names).items() if times > 1):
             raise ValueError(f"{', '.join(twice)} would be made twice; take it out of all but one block")
         for cell in self.cells():
-            check(cell.settings)
             refuse_unbuildable(cell)
         self._refuse_without_effect(self.overrides, self.cells())
         for block in self.blocks:
@@ -140,16 +156,13 @@ class Study(Block):
                 raise ValueError(f"in the overrides {idle[0][name]}")
 
     def _cells_of(self, block: Block) -> Iterator[Cell]:
-        kinds = kinds_of(Settings)
-        overrides = {
-            name: fitted(name, value, kinds[name]) for name, value in {**self.overrides, **block.overrides}.items()
-        }
+        overrides = {**self.overrides, **block.overrides}
         for position in range(0, len(block.seeds), self.seeds_per_cell):
             seeds = block.seeds[position : position + self.seeds_per_cell]
             for environment, task, arm in itertools.product(block.environments, block.tasks, block.arms):
                 settings = dataclasses.replace(
                     PROTOCOLS[self.protocol],
-                    **overrides | ARMS[arm].settings,
+                    **{**overrides, **ARMS[arm].settings},
                     task=task,
                     seed=seeds[0],
                     num_runs=len(seeds),
@@ -205,34 +218,11 @@ def from_json(path: Path) -> Study:
     """A study from a file.
 
     Raises:
-        ValueError: if it cannot be read, or holds something that a study has not.
+        ValueError: if it cannot be read, or is no study.
     """
     try:
-        return _parsed(Study, json.loads(path.read_text()))
+        return TypeAdapter(Study).validate_json(path.read_bytes())
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise ValueError(f"{path} is no study: {error}") from None
-
-
-def _parsed(owner: type[Any], written: object) -> Any:
-    """A study or a block of one from what JSON has."""
-    values = dict(fitted("it", written, Mapping[str, Any]))
-    fields = {field.name: field for field in dataclasses.fields(owner)}
-    if other := sorted(values.keys() - fields):
-        raise ValueError(f"it has {', '.join(other)}; there are {', '.join(sorted(fields))}")
-    needed = {name for name, field in fields.items() if field.default is field.default_factory is dataclasses.MISSING}
-    if lacking := sorted(needed - values.keys()):
-        raise ValueError(f"it has no {', '.join(lacking)}; it needs {', '.join(sorted(needed))}")
-    if "blocks" in values:
-        blocks = fitted("blocks", values["blocks"], tuple[Mapping[str, Any], ...])
-        values["blocks"] = tuple(itertools.starmap(_block, enumerate(blocks, start=1)))
-    kinds = kinds_of(owner)
-    return owner(**{name: fitted(name, value, kinds[name]) for name, value in values.items()})
-
-
-def _block(number: int, written: object) -> Block:
-    try:
-        return _parsed(Block, written)
-    except ValueError as error:
-        raise ValueError(f"in block {number}: {error}") from None
+    except ValidationError as error:
+        raise ValueError(f"{path} is no study: {sentence(error, Study)}") from None

@@ -48,26 +48,26 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
 WRONG: list[tuple[Any, str]] = [
     (
         [LEAST],
-        "it is [{'arms': ['none'], 'environments': ['hopper'], 'name': 's', 'protocol': 'smoke', ...}], it must be a",
+        "it is [{'arms': ['none'], 'environments': ['hopper'], 'name': 's', 'protocol': 'smoke', ...}], it must be a ",
     ),
     (None, "it is None, it must be a mapping of names to values"),
     (3, "it is 3, it must be a mapping of names to values"),
-    ({"seed": 1}, "it has seed; there are arms, blocks"),
-    ({"name": "a"}, "it has no arms, environments, seeds; it needs arms, environments, name, seeds"),
+    ({"seed": 1}, "there is no seed; there are environments, arms"),
+    ({"name": "a"}, "it has no environments, arms, seeds; add what is missing"),
     (LEAST | {"name": 3}, "name is 3, it must be a string"),
-    (LEAST | {"protocol": ["smoke"]}, "protocol is ['smoke'], it must be one of paper, preview, smoke"),
-    (LEAST | {"environments": "hopper"}, "environments is 'hopper', it must be a list of strings"),
-    (LEAST | {"environments": [["hopper"]]}, "environments is [['hopper']], it must be a list of strings"),
+    (LEAST | {"protocol": ["smoke"]}, "protocol is ['smoke'], it must be 'paper', 'preview' or 'smoke'"),
+    (LEAST | {"environments": "hopper"}, "environments is 'hopper', it must be a list"),
+    (LEAST | {"environments": [["hopper"]]}, "environments has ['hopper'], each must be a string"),
     (LEAST | {"environments": []}, "environments is empty"),
     (LEAST | {"arms": []}, "arms is empty"),
     (LEAST | {"tasks": []}, "tasks is empty"),
-    (LEAST | {"seeds": []}, "seeds is empty, and nothing is to be computed then; name at least one of them"),
-    (LEAST | {"seeds": 3}, "seeds is 3, it must be a list of whole numbers"),
-    (LEAST | {"seeds": "012"}, "seeds is '012', it must be a list of whole numbers"),
-    (LEAST | {"seeds": ["0"]}, "seeds is ['0'], it must be a list of whole numbers"),
-    (LEAST | {"seeds": [0.5]}, "seeds is [0.5], it must be a list of whole numbers"),
-    (LEAST | {"seeds": [True]}, "seeds is [True], it must be a list of whole numbers"),
-    (LEAST | {"seeds": [0, -1]}, "seeds is (0, -1), each must be at least 0"),
+    (LEAST | {"seeds": []}, "seeds is empty; name at least one entry"),
+    (LEAST | {"seeds": 3}, "seeds is 3, it must be a list"),
+    (LEAST | {"seeds": "012"}, "seeds is '012', it must be a list"),
+    (LEAST | {"seeds": ["0"]}, "seeds has '0', each must be a whole number"),
+    (LEAST | {"seeds": [0.5]}, "seeds has 0.5, each must be a whole number"),
+    (LEAST | {"seeds": [True]}, "seeds has True, each must be a whole number"),
+    (LEAST | {"seeds": [0, -1]}, "seeds has -1, each must be at least 0"),
     (LEAST | {"seeds": [1, 1]}, "seeds has 1 more than once; name each of them once"),
     (LEAST | {"seeds_per_cell": 1.5}, "seeds_per_cell is 1.5, it must be a whole number"),
     (LEAST | {"overrides": None}, "overrides is None, it must be a mapping of names to values"),
@@ -75,9 +75,12 @@ WRONG: list[tuple[Any, str]] = [
     (LEAST | {"overrides": {"episodes": "20"}}, "episodes is '20', it must be a whole number"),
     (LEAST | {"overrides": {"num_designs": 0}}, "num_designs is 0, it must be at least 1"),
     (LEAST | {"overrides": {"first_design": [3, 1, 1, 1]}}, "a design of hopper has 4 scale factors from 0.5 to 2.0"),
-    (LEAST | {"blocks": BLOCK}, "it must be a list of mappings of names to values"),
-    (LEAST | {"blocks": ["walker"]}, "blocks is ['walker'], it must be a list of mappings of names to values"),
-    (LEAST | {"blocks": [BLOCK, {"arms": ["none"]}]}, "in block 2: it has no environments, seeds"),
+    (
+        LEAST | {"blocks": BLOCK},
+        "'environments': ['walker'], 'seeds': [0]}, it must be a list",
+    ),
+    (LEAST | {"blocks": ["walker"]}, "blocks has 'walker', each must be a mapping of names to values"),
+    (LEAST | {"blocks": [BLOCK, {"arms": ["none"]}]}, "in block 2: it has no environments, seeds; add what is missing"),
     (LEAST | {"blocks": [BLOCK | {"overrides": {"compile": "yes"}}]}, "compile is 'yes', it must be true or false"),
     (LEAST | {"blocks": [BLOCK, BLOCK]}, "walker-forward-none-0 would be made twice; take it out of all but one block"),
 ]
@@ -98,5 +101,5 @@ def test_a_file_that_is_no_study_is_refused_in_a_sentence_and_leaves_no_folder(
 
 def test_a_file_that_is_no_json_is_no_study(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("[")
-    with pytest.raises(ValueError, match=r"a.json is no study: Expecting value: line 1"):
+    with pytest.raises(ValueError, match=r"a.json is no study: Invalid JSON: EOF while parsing a list at line 1"):
         from_json(tmp_path / "a.json")
