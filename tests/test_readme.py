@@ -9,24 +9,15 @@ from pathlib import Path
 import pytest
 
 from coim import HopperMorph
-from coim.experiments.run.settings import Settings
+from coim.experiments.study.definition import PROTOCOLS
 from coim.experiments.train import run
 
 README = Path(__file__).parents[1] / "README.md"
 SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
 
 
-# Of the run whose folder a snippet opens.
-TINY = Settings(
-    num_designs=1,
-    first_episodes=1,
-    episode_steps=6,
-    individual_updates=1,
-    population_updates=1,
-    imagine="none",
-    threads=1,
-    quiet=True,
-)
+# The run whose folder a snippet opens.
+TINY = dataclasses.replace(PROTOCOLS["smoke"], num_designs=1, imagine="none", threads=1, quiet=True)
 
 
 def test_there_are_nine_snippets() -> None:

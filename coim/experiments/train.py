@@ -31,21 +31,18 @@ from coim.experiments.run.interrupt import (
 )
 from coim.experiments.run.last_words import last_words
 from coim.experiments.run.machine import (
-    FORMERLY,
     available_cores,
     check_compiler,
     checked_device,
-    choose_products,
     folder_of_compiled_code,
     prepare,
     words_of,
 )
 from coim.experiments.run.progress import Progress
 from coim.experiments.run.results import Results, folder_of
-from coim.experiments.run.resume import check_origin, refuse_filled, refuse_lost_checkpoints, saved_settings
+from coim.experiments.run.resume import begin_or_resume
 from coim.experiments.run.settings import QUICK, Settings
 from coim.experiments.run.wandb_log import WandbLog
-from coim.run_folder import read_config
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
@@ -93,16 +90,7 @@ def train(
     """
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
-    if settings.resume is None:
-        if settings.out is not None:
-            refuse_filled(settings.out)
-        products = choose_products(settings.products)
-    else:
-        check_origin(settings.resume, name, settings)
-        refuse_lost_checkpoints(settings.resume)
-        begun = read_config(settings.resume).get("products", FORMERLY._asdict())
-        changed = saved_settings(settings.resume).products != settings.products
-        products = choose_products(settings.products, begun=begun, changed=changed)
+    products = begin_or_resume(name, settings)
     if settings.compile:
         check_compiler()
     with folder_of(name, settings) as folder:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -9,26 +10,11 @@ import pytest
 from coim import HopperMorph
 from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.settings import Settings
+from coim.experiments.study.definition import PROTOCOLS
 from coim.experiments.train import main
 from coim.experiments.train import run as run_recipe
 
-TINY = Settings(
-    num_designs=4,
-    first_episodes=2,
-    episodes=2,
-    episode_steps=6,
-    num_cells=(8,),
-    model_cells=(8,),
-    individual_updates=2,
-    population_updates=2,
-    model_updates=2,
-    batch_size=10,
-    num_particles=4,
-    num_iterations=2,
-    num_start_states=3,
-    threads=1,
-    quiet=True,
-)
+TINY = dataclasses.replace(PROTOCOLS["smoke"], num_designs=4, first_episodes=2, episodes=2, threads=1, quiet=True)
 SAVES = 4 + 4 * 2  # each chosen design and each episode
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 from typing import get_args
@@ -14,21 +15,25 @@ from coim.events import Kind
 from coim.experiments.drawing.palette import KINDS
 from coim.experiments.run.build import episodes_of_designs, make_buffers
 from coim.experiments.run.command_line import parse
+from coim.experiments.run.last_words import options
 from coim.experiments.run.settings import PRESETS, Settings
+from coim.experiments.study.definition import PROTOCOLS
 from coim.experiments.train import main
 
 XI = ["xi_torso", "xi_thigh", "xi_shank", "xi_foot"]
-TINY = ["--num-designs", "7", "--first-episodes", "1", "--episodes", "1", "--episode-steps", "6", "--num-cells", "8"]
-TINY += ["--individual-updates", "2", "--population-updates", "2", "--batch-size", "10", "--num-start-states", "3"]
-MODEL = ["--model-updates", "2", "--model-cells", "8"]
-SWARM = ["--num-particles", "4", "--num-iterations", "2"]
+# Options of the smallest run that has every kind of design, and those of them that have no effect beside some others.
+TINY = options(dataclasses.replace(PROTOCOLS["smoke"], num_designs=7))
+IDLE_BESIDE = {
+    **{word: {"--model-updates", "--model-cells"} for word in ("none", "simulator")},
+    **{word: {"--num-particles", "--num-iterations"} for word in ("fixed", "gradient")},
+}
 
 
-def tiny(*options: str) -> list[str]:
+def tiny(*given: str) -> list[str]:
     """Options of a tiny run, without those that have no effect beside the given ones."""
-    model = [] if {"none", "simulator"} & {*options} else MODEL
-    swarm = [] if {"fixed", "gradient"} & {*options} else SWARM
-    return [*TINY, *model, *swarm, *options]
+    idle = set().union(*(IDLE_BESIDE.get(word, set()) for word in given))
+    words = [word for pair in zip(TINY[::2], TINY[1::2]) if pair[0] not in idle for word in pair]
+    return [*words, *given]
 
 
 def run(folder: Path, *options: str) -> None:
@@ -122,7 +127,7 @@ def test_offline_wandb_needs_no_account(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--imagined-share", "1.5"], "share is 1.5, it must lie in [0, 1]"),
+        (["--imagined-share", "1.5"], "share is 1.5, it must be at most 1"),
         (["--device", "cuda:99"], "device 'cuda:99' cannot be used here"),
         (["--device", "abacus"], "device 'abacus' cannot be used here"),
         (["--num-runs", "0"], "--num-runs is 0, it must be at least 1"),

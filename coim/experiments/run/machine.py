@@ -16,7 +16,6 @@ from coim.products import Choice, Library, Named, use
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 KEPT = 1 << 30  # bytes
-FORMERLY = Choice("onednn", "onednn")  # the products of runs that say nothing of theirs
 
 
 def available_cores() -> int:

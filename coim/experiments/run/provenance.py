@@ -1,4 +1,4 @@
-"""Where a run comes from, as its ``config.json`` has it: settings, versions, machine, revision, time."""
+"""The origin of a run, as ``config.json`` has it: settings, versions, machine, revision, time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "num
 
 
 def versions() -> dict[str, str]:
-    """Of everything that decides about the numbers."""
+    """Versions of Python and of the packages that the numbers depend on."""
     return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
 
 
 def describe(environment: str, settings: Settings) -> dict[str, Any]:
-    """Everything that somebody needs to repeat the run."""
+    """Everything that is needed to repeat the run."""
     return {
         "environment": environment,
         "settings": plain(settings),
@@ -41,10 +41,10 @@ def now() -> str:
 
 
 def git_revision() -> str | None:
-    """Commit of the checkout that this file belongs to, with ``-dirty`` where it was changed.
+    """Commit of the checkout of this file, with ``-dirty`` if files in it were changed.
 
     Returns:
-        None outside of a checkout; also where coim is installed somewhere inside of another project's.
+        None outside of a checkout, and where coim is installed inside of another project's checkout.
     """
     here = Path(__file__)
     describe = ["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]

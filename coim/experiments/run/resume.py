@@ -1,4 +1,4 @@
-"""Rules about what may be resumed."""
+"""All rules about resuming a run: what may differ, what is refused, and what is written down about it."""
 
 from __future__ import annotations
 
@@ -11,18 +11,50 @@ from typing import Any
 from coim.checkpoints import PREFIX
 from coim.experiments.run.atomic_write import ASIDE, write_whole
 from coim.experiments.run.interrupt import LOCK
+from coim.experiments.run.machine import choose_products
 from coim.experiments.run.provenance import git_revision, now, versions
-from coim.experiments.run.settings import ELSEWHERE, LATER, Settings, plain
-from coim.products import chosen
+from coim.experiments.run.settings import Settings, plain
+from coim.products import Choice, chosen
 from coim.run_folder import read_config
 
-# What may differ when a run is gone on with, because no number of its past depends on it. Other products round the
-# numbers to come otherwise, as other versions do.
+# Settings that may change when a run is resumed, because no number of its past depends on them. Other products round
+# later numbers differently, as other versions do.
 FREE = {"num_designs", "threads", "products", "checkpoint_every", "resume", "wandb", "quiet"}
+# Settings that may change because the machine may lack what they name. Later numbers differ, at first within rounding.
+ELSEWHERE = ("device", "replay_device", "compile")
+# Settings that may differ between a finished cell of a study and the same cell as it is asked for.
+OF_NO_NUMBER = FREE | {"out", "device", "replay_device", "name"}
+# Settings that older folders lack. Their defaults are what every run had before.
+LATER = {"replay_device", "products", "value_states", "value_over"}
+LATER |= {"imagined_states", "imagined_actions", "anchored", "governed"}
+FORMERLY = Choice("onednn", "onednn")  # the products of runs whose folder does not name them
+
+
+def begin_or_resume(name: str, settings: Settings) -> Choice:
+    """Refuse a run that can be neither begun nor resumed, and choose the library of its products.
+
+    Args:
+        name: of the environment.
+        settings: of the run; ``resume`` names its folder if it is to be resumed.
+
+    Raises:
+        FileExistsError: if a new run is to use a folder that holds something.
+        ValueError: if the run to resume is one of another environment, has lost its checkpoints, or this machine
+            lacks the library that was asked for.
+    """
+    if settings.resume is None:
+        if settings.out is not None:
+            refuse_filled(settings.out)
+        return choose_products(settings.products)
+    check_origin(settings.resume, name, settings)
+    refuse_lost_checkpoints(settings.resume)
+    begun = read_config(settings.resume).get("products", FORMERLY._asdict())
+    changed = saved_settings(settings.resume).products != settings.products
+    return choose_products(settings.products, begun=begun, changed=changed)
 
 
 def refuse_filled(folder: Path) -> None:
-    """Leave a folder alone that holds anything but our own lock, and a first file that was not finished."""
+    """Refuse a folder that holds anything but a lock and an unfinished first file of ours."""
     ours = {LOCK, ASIDE.format("config.json")}
     if folder.exists() and (not folder.is_dir() or any(path.name not in ours for path in folder.iterdir())):
         raise FileExistsError(
@@ -32,7 +64,7 @@ def refuse_filled(folder: Path) -> None:
 
 
 def note_resumption(folder: Path, settings: Settings) -> None:
-    """Write into ``config.json`` that the run went on: when, by which code, and with which other settings."""
+    """Add a resumption to ``config.json``: its time, its code, and the settings that changed."""
     config = read_config(folder)
     moved = changes(saved_settings(folder), settings)
     products = chosen()._asdict()
@@ -46,10 +78,10 @@ def note_resumption(folder: Path, settings: Settings) -> None:
 
 
 def refuse_lost_checkpoints(folder: Path) -> None:
-    """Refuse to go on with a run that has rows and no checkpoint: it would begin anew over them.
+    """Refuse to resume a run that has rows and no checkpoint: it would start again over them.
 
     Raises:
-        ValueError: as for a copy of its tables alone. A run makes a checkpoint before its first row.
+        ValueError: such as for a copy of its tables alone. A run saves a checkpoint before its first row.
     """
     rows = folder / "evaluations.csv"
     if rows.is_file() and rows.read_bytes().count(b"\n") > 1 and not any((folder / "checkpoint").glob(f"{PREFIX}-*")):
@@ -72,7 +104,7 @@ def check_origin(folder: Path, name: str, settings: Settings) -> None:
 
 
 def to_go_on(settings: Settings) -> Settings:
-    """The settings with which a cell is begun, or with which its run is resumed.
+    """Return the settings that begin or resume the run of a cell.
 
     Raises:
         ValueError: if the folder holds files of a run and no config.json; see also `resumed`.
@@ -92,11 +124,10 @@ def to_go_on(settings: Settings) -> Settings:
 
 
 def resumed(settings: Settings, folder: Path) -> Settings | None:
-    """The settings with which a run goes on; None if it has not begun. Nothing is changed on disk.
+    """Return the settings that resume a run, or None if it has not begun. Nothing changes on disk.
 
     Raises:
-        ValueError: if it was begun with settings on which its past depends and which are others now, or its folder has
-            rows and no checkpoint.
+        ValueError: if a setting changed that its past depends on, or its folder has rows and no checkpoint.
     """
     if not (folder / "config.json").exists():
         return None
@@ -108,12 +139,33 @@ def resumed(settings: Settings, folder: Path) -> Settings | None:
     return going_on
 
 
-def saved_settings(folder: Path) -> Settings:
-    """The settings of the run in a folder.
+def still_finished(settings: Settings, folder: Path) -> bool:
+    """Whether a finished cell of a study still is what the study asks for.
+
+    Returns:
+        False if its folder is gone, or if more designs are asked for than it has tried.
 
     Raises:
-        ValueError: if there is none, or one of a version that had other settings. Those that came later take their
-            defaults.
+        ValueError: if it was made with other settings: it would be compared with runs of another protocol.
+    """
+    if not (folder / "config.json").exists():
+        return False
+    saved, asked = read_config(folder)["settings"], json.loads(json.dumps(plain(settings)))
+    more = asked["num_designs"] > saved["num_designs"]
+    fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})
+    if other := [name for name in sorted(fixed) if saved[name] != asked[name]]:
+        told = ", ".join(f"{name} ({saved[name]!r} to {asked[name]!r})" for name in other)
+        raise ValueError(
+            f"the run in {folder} was made with other settings: {told}; leave them, or take another folder"
+        )
+    return not more
+
+
+def saved_settings(folder: Path) -> Settings:
+    """Read the settings of the run in a folder; those that its version did not have take their defaults.
+
+    Raises:
+        ValueError: if the folder holds no run, or a run of a version with other settings.
     """
     saved = read_config(folder)["settings"]
     fields = {field.name for field in dataclasses.fields(Settings)}
@@ -127,13 +179,17 @@ def saved_settings(folder: Path) -> Settings:
 
 
 def changes(old: Settings, new: Settings) -> dict[str, list[Any]]:
-    """Settings that differ, old and new value; where a run is resumed from is no setting of it."""
+    """Return the settings that differ, each with its old and its new value; ``resume`` is left out."""
     one, other = plain(old), plain(new)
     return {name: [one[name], other[name]] for name in one if one[name] != other[name] and name != "resume"}
 
 
 def refuse_changes(old: Settings, new: Settings) -> None:
-    """Refuse by name what cannot be changed in the middle of a run."""
+    """Refuse settings that cannot change in the middle of a run.
+
+    Raises:
+        ValueError: with their names, old and new values, and the settings that may change.
+    """
     fixed = {name: values for name, values in changes(old, new).items() if name not in {*FREE, *ELSEWHERE}}
     if fixed:
         told = ", ".join(f"{name} ({was!r} to {wanted!r})" for name, (was, wanted) in fixed.items())

@@ -40,33 +40,33 @@ class Settings:
 
     # -- what is asked ------------------------------------------------------------------------------------------------
     preset: Literal["paper", "quick"] = "paper"
-    """paper: Sec. 6.1. quick: the same body and networks with fewer designs, episodes and updates, for a first look."""
+    """paper: the protocol of Sec. 6.1. quick: fewer designs, episodes and updates, for a first look."""
     task: Task = "forward"
-    """Which way the speed in the reward counts (Fig. 1, first and second row)."""
+    """Direction in which speed is rewarded (Fig. 1, first and second row)."""
     imagine: Literal["known", "noisy", "random", "none"] = "known"
     """Designs to imagine: those tried, those with noise, uniform ones, or none (the model-free baseline)."""
     dream: Literal["ensemble", "simulator"] = "ensemble"
-    """Who imagines: the learnt ensemble, or the simulator itself, which tells the ensemble's error from the rest."""
+    """Model that imagines: the learnt ensemble, or the simulator, which shows what the ensemble's error costs."""
     bodies: Literal["search", "random", "fixed"] = "search"
-    """Bodies after the first ones: optimised and random in turn, all random, or the first one from start to end."""
+    """Bodies after the first ones: optimised and random in turn, all random, or always the first one."""
     first_design: Annotated[tuple[Positive, ...], LISTS] = ()
-    """One body to begin with, as scale factors, instead of the environment's own five."""
+    """First body, as scale factors, in place of the environment's own first bodies."""
     sigma: NonNegative = 0.1
-    """Standard deviation of the noisy designs, in scale factors (Sec. 6.4)."""
+    """Standard deviation of the noise of --imagine noisy, in scale factors (Sec. 6.4)."""
     seed: Amount = 0
-    """Seeds everything; the same seed on the same machine gives the same numbers."""
+    """Seed of all random numbers. The same seed on the same machine gives the same numbers."""
     num_runs: Count = 1
-    """Independent runs that advance in lock-step in this process (the run axis)."""
+    """Seeds trained together in one process; each is an independent run."""
 
     # -- the protocol -------------------------------------------------------------------------------------------------
     num_designs: Count = 55
-    """M, bodies tried: five first designs, then optimised and random ones in turn."""
+    """Bodies to try (the paper's M): the first ones, then optimised and random ones in turn."""
     first_episodes: Count = 300
     """Episodes on each of the first designs."""
     episodes: Count = 100
     """Episodes on each later design."""
     episode_steps: Count = 1000
-    """Steps of an episode; falling does not end it."""
+    """Steps of an episode. A fall does not end it."""
     individual_updates: Amount = 1000
     """Updates of the individual networks after each episode."""
     population_updates: Amount = 250
@@ -80,9 +80,9 @@ class Settings:
     num_cells: Widths = (200, 200, 200)
     """Hidden units of the policy and of each critic."""
     num_critics: Count = 2
-    """Critics; the smallest value counts."""
+    """Critics. The smallest of their values counts."""
     alpha: NonNegative = 0.01
-    """Entropy temperature, fixed."""
+    """Entropy temperature; it stays fixed."""
     gamma: Share = 0.99
     """Discount."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
@@ -90,79 +90,75 @@ class Settings:
     lr: Positive = 3e-4
     """Adam's learning rate of policy and critics."""
     individual_mix: Share = 0.0
-    """Share of an individual batch drawn from the population's replay (the predecessor's code has 0.1)."""
+    """Share of an individual batch from the population's replay (0.1 in the code of the paper's predecessor)."""
 
     # -- imagination --------------------------------------------------------------------------------------------------
     imagined_share: Share = 0.2
     """Share of a population batch that is imagined (Sec. 5)."""
     individual_imagined_share: Share = 0.0
-    """Share of an individual batch that is imagined (0 as in Sec. 5; Algorithm 1 cites Eq. 7-8 for it too)."""
+    """Share of an individual batch that is imagined (Sec. 5: 0; Algorithm 1 cites Eq. 7-8 here too)."""
     imagined_states: Literal["stored", "matched"] = "stored"
-    """What a state is under another design: as it was stored (the paper's), or with the root moved by what the legs
-    differ in, without pairs that no body can be in."""
+    """State under another design. stored: unchanged (the paper). matched: with the same clearance to the floor."""
     imagined_actions: Literal["fresh", "replayed"] = "fresh"
-    """Actions of imagined rows: fresh ones of the population's policy (the paper's), or those of the replay."""
+    """Actions of imagined rows: fresh from the population's policy (the paper), or replayed from its replay."""
     anchored: bool = False
-    """Imagine what another design and action change of a real transition, instead of the whole next observation."""
+    """Imagine how a real transition changes with the design and the action, not the whole next observation."""
     governed: bool = False
-    """Take the imagined shares as the most that the model can earn, by its errors on episodes that it has not learnt
-    from. Where it earns nothing, the run is the model-free baseline."""
+    """Let the model's error set how much is imagined, at most the imagined shares; a poor model imagines nothing."""
     mix: Literal["batch", "sum"] = "batch"
-    """batch: one mean over real and imagined rows (Sec. 5). sum: the two expectations of Eq. 7-8 as printed."""
+    """batch: one mean over real and imagined rows (Sec. 5). sum: the sum of two expectations (Eq. 7-8 as printed)."""
     num_members: Count = 3
-    """Networks in the dynamics ensemble."""
+    """Networks of the dynamics ensemble."""
     model_cells: Widths = (500, 500, 500)
-    """Hidden units of each of them."""
+    """Hidden units of each network of the ensemble."""
     model_lr: Positive = 3e-4
     """Adam's learning rate of the ensemble."""
     weight_decay: NonNegative = 1e-5
     """L2 penalty of the ensemble."""
     predict: Literal["delta", "next"] = "delta"
-    """What the ensemble's Gaussian is over: the change of the observation, or the next one (Eq. 6 as printed)."""
+    """Output of the ensemble: the change of the observation, or the next observation (Eq. 6 as printed)."""
 
     # -- design search ------------------------------------------------------------------------------------------------
     search: Literal["swarm", "gradient"] = "swarm"
-    """What maximises Eq. 5: a particle swarm (Sec. 4), or gradient ascent through the critics from many starts."""
+    """Search that maximises Eq. 5: a particle swarm (Sec. 4), or gradient ascent from many starts."""
     num_particles: Count = 700
     """Particles of the swarm."""
     num_iterations: Count = 250
     """Iterations of the swarm."""
     swarm_bounds: Literal["nearest", "periodic"] = "nearest"
-    """What becomes of a particle that leaves the bounds: clipped, or back in on the other side (the predecessor's)."""
+    """nearest: a particle outside the bounds is clipped. periodic: it enters on the other side (the predecessor)."""
     num_start_states: Count = 36
-    """Start states that Eq. 5 averages over."""
+    """Start states in the mean of Eq. 5."""
     value_states: Literal["stored", "matched"] = "stored"
-    """What a state is under the design that Eq. 5 asks about: as for imagined_states."""
+    """State under the design that Eq. 5 asks about: stored or matched, as in --imagined-states."""
     value_over: Literal["start", "visited"] = "start"
-    """States that Eq. 5 averages over: those that episodes start with (the paper's), or any that were visited."""
+    """States in the mean of Eq. 5: states at the start of episodes (the paper), or all states visited."""
 
     # -- this machine -------------------------------------------------------------------------------------------------
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the networks' products; weights, moments, targets and losses stay float32."""
+    """Precision of the networks' products. Weights, moments, targets and losses are always float32."""
     products: Literal["auto", "onednn", "torch"] = "auto"
-    """Library that multiplies on the CPU: what was measured to be fastest on such a processor, or one by name. A run
-    that is gone on with keeps that of its first part."""
+    """Library that multiplies on the CPU; auto takes the fastest known. A resumed run keeps the one it has."""
     compile: bool = False
-    """Compile the learners' gradients in the first update (torch.compile): seconds to a minute, then faster updates.
-    On in preset paper."""
+    """Compile the gradients with torch.compile: up to a minute at the start, then faster. On in preset paper."""
     device: str = "cpu"
-    """Where the networks live: cpu, cuda, cuda:1, ..."""
+    """Device of the networks: cpu, cuda, cuda:1, ..."""
     replay_device: Literal["same", "cpu"] = "same"
-    """Where the replay lives: same as the networks, or cpu where a GPU has no room for it; batches are moved then."""
+    """Device of the replay: same as the networks, or cpu if the GPU has too little memory for it."""
     threads: Amount = 0
-    """Threads that may be busy at once; 0 takes one for each core that this process may use."""
+    """Threads to use at once; 0 uses one for each core available to this process."""
     out: Path | None = None
     """Folder for the results; by default runs/ENVIRONMENT-DATE-NAME."""
     resume: Path | None = None
-    """Go on with the run in this folder from its last checkpoint; its settings are read there."""
+    """Folder of a run to resume from its last checkpoint, with the settings in that folder."""
     checkpoint_every: Count = 1
     """Episodes between two checkpoints."""
     name: str = "run"
-    """Last part of the default folder's name."""
+    """Last part of the name of the default folder."""
     wandb: Literal["off", "offline", "online"] = "off"
-    """Send the numbers of the CSV files to Weights & Biases as well."""
+    """Also send the numbers of the CSV files to Weights & Biases."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
 
     def __post_init__(self) -> None:  # errors have the names of settings in backticks, for `pydantic_errors.sentence`
         if self.dream == "simulator" and self.imagine == "none":
@@ -188,11 +184,6 @@ QUICK = Settings(
     name="quick",
 )
 
-# What a machine may not have on which a run is gone on with. Its numbers differ from there, within rounding at first.
-ELSEWHERE = ("device", "replay_device", "compile")
-# Settings that came later, with a default that is what all runs had before; these may be missing in a run's folder.
-LATER = {"replay_device", "products", "value_states", "value_over"}
-LATER |= {"imagined_states", "imagined_actions", "anchored", "governed"}
 FIELDS = {field.name for field in dataclasses.fields(Settings)}
 PRESETS = {"paper": Settings(compile=True), "quick": QUICK}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import traceback
@@ -13,14 +12,12 @@ from coim.envs import BODIES
 from coim.experiments.frames import read_frame
 from coim.experiments.run.interrupt import ANY_NAME
 from coim.experiments.run.provenance import now
-from coim.experiments.run.resume import FREE, to_go_on
-from coim.experiments.run.settings import Settings, plain
+from coim.experiments.run.resume import to_go_on
+from coim.experiments.run.settings import Settings
 from coim.experiments.train import run
-from coim.run_folder import EVALUATIONS, read_config
+from coim.run_folder import EVALUATIONS
 
 STARTED = "started"  # how a line of a log begins with which a try began
-# A finished run is what it is wherever it was made and is called.
-OF_NO_NUMBER = FREE | {"out", "device", "replay_device", "name"}
 
 
 def compute(environment: str, settings: Settings, log: Path) -> None:
@@ -40,28 +37,6 @@ def compute(environment: str, settings: Settings, log: Path) -> None:
             traceback.print_exc()
             raise
         print(f"finished {now()}")
-
-
-def still_finished(settings: Settings, folder: Path) -> bool:
-    """Whether a cell that was finished once is what the study asks for now.
-
-    Returns:
-        False if its folder is gone, or if it is to try more designs than it has tried.
-
-    Raises:
-        ValueError: if it was made with other settings: it would be compared with runs of another protocol.
-    """
-    if not (folder / "config.json").exists():
-        return False
-    saved, asked = read_config(folder)["settings"], json.loads(json.dumps(plain(settings)))
-    more = asked["num_designs"] > saved["num_designs"]
-    fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})
-    if other := [name for name in sorted(fixed) if saved[name] != asked[name]]:
-        told = ", ".join(f"{name} ({saved[name]!r} to {asked[name]!r})" for name in other)
-        raise ValueError(
-            f"the run in {folder} was made with other settings: {told}; leave them, or take another folder"
-        )
-    return not more
 
 
 def tries(log: Path) -> int:

@@ -1,4 +1,4 @@
-"""A study: environments x tasks x arms x seeds under one protocol, and the run that each cell of it is."""
+"""A study: environments x tasks x arms x seeds under one protocol, with one run per cell."""
 
 from __future__ import annotations
 
@@ -120,11 +120,11 @@ class Study(Block):
     """
 
     name: str
-    """Of its folder, where none is given."""
+    """Name of the study, and of its folder if no other is given."""
     protocol: Protocol = "paper"
     """paper: Sec. 6.1. preview: the same networks and updates with fewer designs and episodes. smoke: seconds."""
     seeds_per_cell: Count = 1
-    """Seeds that one cell advances in lock-step along the run axis, seeded by the first of them: for a GPU."""
+    """Seeds trained together in one cell, for a GPU. The first of them seeds all."""
     blocks: Annotated[tuple[Block, ...], LISTS] = ()
     """More combinations."""
 
@@ -190,7 +190,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of the cell's folder."""
+        """Name of the cell's folder."""
         return f"{self.environment}-{self.settings.task}-{self.arm}-{self.settings.seed}"
 
 

@@ -17,9 +17,9 @@ from coim.envs import BODIES
 from coim.experiments.run.build import episodes_of_designs
 from coim.experiments.run.forecast import in_words
 from coim.experiments.run.interrupt import sentence_of
-from coim.experiments.run.resume import resumed
+from coim.experiments.run.resume import resumed, still_finished
 from coim.experiments.run.settings import Settings
-from coim.experiments.study.cell import compute, episodes_done, seconds_of, still_finished, tries
+from coim.experiments.study.cell import compute, episodes_done, seconds_of, tries
 from coim.experiments.study.definition import Cell
 from coim.experiments.study.ledger import Ledger
 

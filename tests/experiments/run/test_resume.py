@@ -24,7 +24,7 @@ from coim.experiments.run.checkpoint import Checkpoints, SharedRandom
 from coim.experiments.run.interrupt import Stopped, end_soon, locked, stopping_at_once
 from coim.experiments.run.records import read_record
 from coim.experiments.run.replay_file import ReplayFile
-from coim.experiments.run.settings import LATER
+from coim.experiments.run.resume import LATER
 from coim.experiments.train import main
 from coim.products import Choice
 from coim.run_folder import EVALUATIONS, read_config
@@ -112,7 +112,7 @@ def test_a_run_that_was_begun_before_a_setting_was_there_goes_on(tmp_path: Path,
     config["settings"]["designs"] = config["settings"].pop("imagine")
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("coim.experiments.train.FORMERLY", Choice(**begun_by))  # what a machine has, whichever this is
+        patched.setattr("coim.experiments.run.resume.FORMERLY", Choice(**begun_by))  # whatever this machine has
         resume(folder)
     assert soak.differences(whole, folder) == []
 
