@@ -10,9 +10,9 @@ class Effort:
     """Sizes and repeats of all rows; the defaults are those of the table that is published."""
 
     repeats: int = 9
-    """Of rows that take seconds."""
+    """Repeats of rows that take seconds."""
     long_repeats: int = 3
-    """Of rows that take half a minute."""
+    """Repeats of rows that take half a minute."""
     threads: tuple[int, ...] = (1, 2)
     """Threads of the updates and the products."""
     runs: tuple[int, ...] = (1, 4, 16)
@@ -44,13 +44,13 @@ class Effort:
 
     # -- whole iterations, bodies, memory -----------------------------------------------------------------------------
     individual_updates: int = 1000
-    """Of one iteration of Algorithm 1."""
+    """Updates of the individual networks in one iteration of Algorithm 1."""
     population_updates: int = 250
-    """Of one iteration of Algorithm 1."""
+    """Updates of the population networks in one iteration of Algorithm 1."""
     model_updates: int = 250
-    """Of one iteration of Algorithm 1."""
+    """Updates of the ensemble in one iteration of Algorithm 1."""
     episode_steps: int = 1000
-    """Of one iteration of Algorithm 1, and of a single body that steps with its policy."""
+    """Steps of an episode in one iteration of Algorithm 1, and of a single body that steps with its policy."""
     fleet_steps: int = 400
     """Steps of an episode of several bodies."""
     replay_rows: int = 6_500_000

@@ -37,13 +37,13 @@ def body_sizes(env: MorphEnv) -> dict[str, int]:
 
 
 def update_products(effort: Effort) -> list[Product]:
-    """Of one update of policy and critics."""
+    """Products of one update of policy and critics."""
     sizes: dict[str, Any] = body_sizes(HalfCheetahMorph(seed=0))
     return sac_products(batch=effort.batch_size, cells=effort.num_cells, **sizes)
 
 
 def model_products(effort: Effort) -> list[Product]:
-    """Of one update of the ensemble."""
+    """Products of one update of the ensemble."""
     sizes: dict[str, Any] = body_sizes(HalfCheetahMorph(seed=0))
     return ensemble_products(batch=effort.batch_size, cells=effort.model_cells, **sizes)
 

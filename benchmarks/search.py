@@ -87,7 +87,7 @@ def _on(body: str, effort: Effort) -> list[Figure]:
 
 
 def _products(env: MorphEnv, effort: Effort) -> list[Product]:
-    """Of one evaluation of the whole swarm, in the chunks in which `DesignValue` takes them."""
+    """Products of one evaluation of the whole swarm, in the chunks in which `DesignValue` takes them."""
     designs = max(1, 2_000 // effort.num_start_states)
     chunks = [len(part) * effort.num_start_states for part in torch.arange(effort.num_particles).split(designs)]
     sizes: dict[str, Any] = body_sizes(env)

@@ -9,11 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = sorted((ROOT / "coim").glob("*.py")) + [
-    path
-    for folder in ("coim/designs", "coim/envs", "coim/learners", "coim/models", "coim/objectives", "recipes")
-    for path in sorted((ROOT / folder).rglob("*.py"))
-]
+SOURCES = [path for folder in ("coim", "recipes", "benchmarks") for path in sorted((ROOT / folder).rglob("*.py"))]
 RIDDLES = re.compile(r"(Of|Whose|Who|What it is that)\b")
 EXCEPTION = re.compile(r"\{?(\w*Error|\w*Exception|type\((error|exception|e)\)\.__name__)\b")
 

@@ -74,7 +74,7 @@ def folders_with(study: Path, file: str) -> dict[Kind, list[Path]]:
 
 
 def name_of(stem: str, kind: Kind, kinds: Iterable[Kind]) -> str:
-    """Of a figure: task and designs are part of it unless those of all kinds are the usual ones.
+    """Name of a figure: task and designs are part of it unless those of all kinds are the usual ones.
 
     Example:
         >>> name_of("figure", Kind("hopper", "forward", "known"), [Kind("hopper", "forward", "known")])

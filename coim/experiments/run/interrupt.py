@@ -28,7 +28,7 @@ ANY_NAME = "backslashreplace"  # folders may have names that cannot be printed; 
 
 
 class Stopped(KeyboardInterrupt):
-    """Somebody told this process to end.
+    """This process was told to end.
 
     Attributes:
         signum: 2 is Ctrl-C, 15 is what schedulers send.
@@ -73,18 +73,18 @@ def stopping_at_once() -> Iterator[None]:
     finally:
         stopped = signal.getsignal(signal.SIGINT) is end
         for signum, handler in before.items():
-            # Who was told to end stays within reach of a second Ctrl-C until the process is gone.
+            # A process that was told to end must end at once at a second Ctrl-C.
             signal.signal(signum, end if stopped else handler)
 
 
 @contextmanager
 def on_command_line(*, own_process: bool, also: tuple[type[Exception], ...] = (), again: str = "") -> Iterator[None]:
-    """Say in one line what was wrong with the input, or that this was told to end, and be gone soon.
+    """End a command with one line where its input is wrong or it was told to end.
 
     Args:
         own_process: whether the process ends with what is done here.
         also: errors that are told in one line, beside those of a value or of the system.
-        again: what somebody does who has told it to end and wants to go on.
+        again: the way to go on after it was told to end.
 
     Raises:
         SystemExit: 128 + 2 after Ctrl-C, 128 + 15 after SIGTERM, or the line of an error.
@@ -185,7 +185,7 @@ def take_lock(file: IO[str]) -> None:
 
 
 def cannot_write(folder: Path, error: OSError) -> OSError:
-    """What to say where a run's folder cannot be made or written to."""
+    """The error for a run's folder that cannot be made or written to."""
     if error.errno in FULL:
         return OSError(f"disk full: {folder} cannot be written to; make room there, or name another one with --out")
     first = "make it writable, or " if error.errno in READ_ONLY else ""

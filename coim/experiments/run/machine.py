@@ -1,4 +1,4 @@
-"""What a run takes of the machine it finds: threads, memory, device, products."""
+"""The machine of a run: threads, memory, device, products."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def prepare(threads: int, device: torch.device) -> bool:
     same cores, while threads that do not wait only share them.
 
     Args:
-        threads: that may be busy at once.
-        device: of the networks.
+        threads: threads that may be busy at once.
+        device: device of the networks.
 
     Returns:
         Whether to train the learners side by side.

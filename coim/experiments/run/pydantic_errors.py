@@ -1,4 +1,4 @@
-"""What pydantic refuses, as one sentence with the value, the bound and the way out."""
+"""Errors of pydantic in one sentence each, with the value, the bound and the way out."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import functools
 import re
 import reprlib
 from collections.abc import Callable
-from typing import Any, TypeVar
+from difflib import get_close_matches
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import ConfigDict, ValidationError
+
+from coim.run_folder import RENAMED
 
 Owner = TypeVar("Owner")
 
@@ -58,7 +61,7 @@ def refused_in_words(owner: type[Owner]) -> type[Owner]:
 
 
 def sentence(error: ValidationError, owner: type[Any], *, called: Callable[[str], str] = str) -> str:
-    """The first thing that pydantic refuses, in words.
+    """The first complaint of pydantic in words.
 
     Args:
         error: pydantic's.
@@ -72,11 +75,11 @@ def sentence(error: ValidationError, owner: type[Any], *, called: Callable[[str]
     where, path = "", first["loc"]
     while len(path) > 2 and isinstance(path[1], int) and isinstance(path[2], str):  # in one entry of a list
         where += f"in {str(path[0]).removesuffix('s')} {path[1] + 1}: "
+        owner = get_args(get_type_hints(owner)[str(path[0])])[0]
         path = path[2:]
     name = called(str(path[0])) if path else "it"
     if unknown:
-        fields = ", ".join(called(field.name) for field in dataclasses.fields(owner))
-        return f"{where}there is no {name}; " + ("leave it out" if where else f"there are {fields}")
+        return f"{where}there is no {name}; {_other_names(str(path[0]), owner, called)}"
     if missing:
         beside = [one["loc"][-1] for one in missing if one["loc"][:-1] == first["loc"][:-1]]
         return f"{where}it has no {', '.join(map(str, beside))}; add what is missing"
@@ -89,3 +92,13 @@ def sentence(error: ValidationError, owner: type[Any], *, called: Callable[[str]
         return where + first["msg"]
     must_be = MUST_BE[first["type"]].format(**first.get("ctx", {}))
     return f"{where}{name} {'has' if entry else 'is'} {value}, {'each' if entry else 'it'} must be {must_be}"
+
+
+def _other_names(unknown: str, owner: type[Any], called: Callable[[str], str]) -> str:
+    """The way out of an unknown name: its name of today, the fields with a similar name, or all fields."""
+    fields = [field.name for field in dataclasses.fields(owner)]
+    if RENAMED.get(unknown) in fields:
+        return f"it is called {called(RENAMED[unknown])} now"
+    if similar := get_close_matches(unknown, fields):
+        return f"similar names are {', '.join(map(called, similar))}"
+    return f"there are {', '.join(map(called, fields))}"

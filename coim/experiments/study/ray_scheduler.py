@@ -1,4 +1,4 @@
-"""Who computes the cells of a study: Ray, on this machine or on a cluster.
+"""Ray computes the cells of a study, on this machine or on a cluster.
 
 Ray decides where and when, and tries again what failed; here is only what it is asked for and what its user hears.
 """
@@ -30,7 +30,7 @@ POLL = 0.5  # s between two looks at who has begun
 
 @dataclasses.dataclass(frozen=True)
 class Resources:
-    """Of each cell.
+    """Resources of each cell.
 
     Attributes:
         cpus: cores, and threads that may be busy at once.
@@ -151,7 +151,7 @@ class Conductor:
 
 
 def settings_in(folder: Path, cell: Cell, resources: Resources) -> Settings:
-    """Of a cell's run, its folder and this machine included."""
+    """Settings of a cell's run, with its folder and its share of this machine."""
     device = {"device": "cuda"} if resources.gpus else {}
     return dataclasses.replace(cell.settings, out=folder / CELLS / cell.name, threads=resources.cpus, **device)
 

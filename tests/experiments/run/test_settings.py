@@ -62,8 +62,10 @@ def test_a_value_that_no_run_can_have_is_named_with_what_it_must_be(name: str, v
 
 
 def test_a_name_that_is_no_setting_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"there is no epsiodes; there are preset, task, imagine, .*episodes"):
+    with pytest.raises(ValueError, match="there is no epsiodes; similar names are episodes"):
         Settings(epsiodes=3)  # type: ignore[call-arg]
+    with pytest.raises(ValueError, match="there is no designs; it is called imagine now"):
+        Settings(designs="none")  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize("settings", [*PRESETS.values(), *PROTOCOLS.values()])

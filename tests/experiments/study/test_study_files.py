@@ -52,7 +52,7 @@ WRONG: list[tuple[Any, str]] = [
     ),
     (None, "it is None, it must be a mapping of names to values"),
     (3, "it is 3, it must be a mapping of names to values"),
-    ({"seed": 1}, "there is no seed; there are environments, arms"),
+    ({"seed": 1}, "there is no seed; similar names are seeds"),
     ({"name": "a"}, "it has no environments, arms, seeds; add what is missing"),
     (LEAST | {"name": 3}, "name is 3, it must be a string"),
     (LEAST | {"protocol": ["smoke"]}, "protocol is ['smoke'], it must be 'paper', 'preview' or 'smoke'"),
@@ -81,6 +81,8 @@ WRONG: list[tuple[Any, str]] = [
     ),
     (LEAST | {"blocks": ["walker"]}, "blocks has 'walker', each must be a mapping of names to values"),
     (LEAST | {"blocks": [BLOCK, {"arms": ["none"]}]}, "in block 2: it has no environments, seeds; add what is missing"),
+    (LEAST | {"blocks": [BLOCK | {"seed": 1}]}, "in block 1: there is no seed; similar names are seeds"),
+    (LEAST | {"blocks": [BLOCK | {"who": 1}]}, "there is no who; there are environments, arms, seeds, tasks, "),
     (LEAST | {"blocks": [BLOCK | {"overrides": {"compile": "yes"}}]}, "compile is 'yes', it must be true or false"),
     (LEAST | {"blocks": [BLOCK, BLOCK]}, "walker-forward-none-0 would be made twice; take it out of all but one block"),
 ]
