@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ DESIGNS = Layout(
     },
     needed=("run", "design", "kind", "predicted", "best_return"),
 )
+EXPECTED = ("expected", "deviation")  # columns of designs.csv where a posterior over returns has chosen the bodies
 METRICS = Layout(  # and a column for each metric, and for the seconds of each part of an episode
     file="metrics.csv",
     columns={"run": int, "design": int, "episode": int, "diverged": str},
@@ -154,13 +155,16 @@ def evaluation_rows(event: EpisodeDone, design_names: Sequence[str], seconds: fl
     ]
 
 
-def design_rows(event: DesignDone, design_names: Sequence[str], predicted: Sequence[float | None]) -> list[Row]:
+def design_rows(
+    event: DesignDone, design_names: Sequence[str], told: Mapping[str, Sequence[float | None]]
+) -> list[Row]:
     """Rows of ``designs.csv`` after the last episode of a design, one for each run that tried it.
 
     Args:
         event: the design.
         design_names: names of the D entries of a design.
-        predicted: Eq. 5 before the design was built, for each of the K runs; None where there was no start state.
+        told: what was said of the design before it was built, by column, for each of the K runs: ``predicted``, Eq. 5,
+            and where a posterior has chosen the ``expected`` return with its ``deviation``; None where nothing was.
     """
     return [
         {
@@ -168,8 +172,8 @@ def design_rows(event: DesignDone, design_names: Sequence[str], predicted: Seque
             "design": event.index + 1,
             "kind": event.kind,
             **dict(zip(design_columns(design_names), event.design[run].tolist())),
-            "predicted": predicted[run],
             "best_return": float(event.best_return[run]),
+            **{name: values[run] for name, values in told.items()},
             "diverged": where_diverged(event, run),
         }
         for run in running(event)

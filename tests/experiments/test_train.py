@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import get_args
 
@@ -243,3 +244,33 @@ def test_a_run_can_begin_with_one_body_of_its_own(tmp_path: Path) -> None:
     rows = read(tmp_path / "evaluations.csv")
     assert [row["kind"] for row in rows] == ["first", "first", "optimised"]
     assert [float(rows[0][name]) for name in XI] == [0.8, 1.2, 1, 1.5]
+
+
+@pytest.mark.parametrize("chosen_by", ["returns", "posterior"])
+def test_a_run_whose_bodies_are_chosen_by_returns_writes_what_it_expects_and_goes_on_alike(
+    chosen_by: str, tmp_path: Path
+) -> None:
+    words = ["--imagine", "none", "--search", "gradient", "--chosen-by", chosen_by, "--value-over", "visited"]
+    run(tmp_path / "whole", *words)
+    run(tmp_path / "part", *words, "--num-designs", "6")
+    main(HopperMorph, "hopper", ["--resume", str(tmp_path / "part"), "--num-designs", "7"])
+    whole, part = (read(tmp_path / name / "designs.csv") for name in ("whole", "part"))
+    assert whole == part
+    known = [row["expected"] != "" and row["deviation"] != "" for row in whole]
+    assert known == [False] * 3 + [True] * 4  # from three returns on
+    assert all(float(row["deviation"]) > 0 for row in whole[3:])
+    assert (tmp_path / "whole" / "report.html").exists()
+
+
+def test_a_run_by_eq_5_has_no_columns_of_what_is_expected(tmp_path: Path) -> None:
+    run(tmp_path / "run")
+    assert not {"expected", "deviation"} & read(tmp_path / "run" / "designs.csv")[0].keys()
+
+
+def test_returns_without_botorch_are_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "coim.posterior_choice", raising=False)
+    monkeypatch.delitem(sys.modules, "coim.designs.posterior", raising=False)
+    monkeypatch.setitem(sys.modules, "botorch", None)
+    monkeypatch.setitem(sys.modules, "botorch.settings", None)
+    with pytest.raises(SystemExit, match=r"pip install 'coim\[posterior\]', or choose bodies by value"):
+        run(tmp_path / "run", "--chosen-by", "returns")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,17 +82,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         population=population,
         individual=individual,
         buffers=buffers,
-        design_choice=DesignChoice(
-            env.design_spec,
-            torch.tensor(first_designs(body, settings), dtype=torch.float32, device=device),
-            search=search,
-            bodies=settings.bodies,
-            num_start_states=settings.num_start_states,
-            value_states=settings.value_states,
-            value_over=settings.value_over,
-            precision=settings.precision,
-            seed=seed,
-        ),
+        design_choice=make_choice(env, settings, search, seed=seed),
         dynamics=dynamics,
         imagined=imagined,
         num_designs=settings.num_designs,
@@ -101,6 +92,32 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         side_by_side=side_by_side,
         seed=seed,
     )
+
+
+def make_choice(env: MorphEnv, settings: Settings, search: DesignSearch, *, seed: int) -> DesignChoice:
+    """Which body comes next, by its name on the command line.
+
+    Raises:
+        ValueError: if BoTorch is asked for and not installed.
+    """
+    first = torch.tensor(first_designs(type(env), settings), dtype=torch.float32, device=env.device)
+    given: dict[str, Any] = {
+        "search": search,
+        "bodies": settings.bodies,
+        "num_start_states": settings.num_start_states,
+        "value_states": settings.value_states,
+        "value_over": settings.value_over,
+        "reach": settings.reach,
+        "precision": settings.precision,
+        "seed": seed,
+    }
+    if settings.chosen_by == "value":
+        return DesignChoice(env.design_spec, first, **given)
+    try:
+        from coim.posterior_choice import PosteriorChoice
+    except ImportError as error:
+        raise ValueError(f"{error}, or choose bodies by value") from error
+    return PosteriorChoice(env.design_spec, first, critic=settings.chosen_by == "posterior", **given)
 
 
 def update_plan(settings: Settings) -> UpdatePlan:

@@ -14,7 +14,7 @@ ROWS = ("mix", "imagined_states", "imagined_actions", "anchored", "governed")
 IMAGINATION = ("dream", "sigma", "imagined_share", "individual_imagined_share", *ROWS, *MODEL)
 # What has no effect, when, and the setting that decides it.
 RULES: tuple[tuple[tuple[str, ...], Callable[[Settings], bool], str], ...] = (
-    (("search", *SWARM), lambda settings: settings.bodies != "search", "bodies"),
+    (("search", "chosen_by", "reach", *SWARM), lambda settings: settings.bodies != "search", "bodies"),
     (SWARM, lambda settings: settings.search == "gradient", "search"),
     (IMAGINATION, lambda settings: settings.imagine == "none", "imagine"),
     (("sigma",), lambda settings: settings.imagine != "noisy", "imagine"),

@@ -20,7 +20,7 @@ from coim.experiments.run.provenance import describe
 from coim.experiments.run.records import number
 from coim.experiments.run.resume import note_resumption, refuse_filled
 from coim.experiments.run.settings import Settings
-from coim.run_folder import DESIGNS, EVALUATIONS, METRICS, Row, design_rows, evaluation_rows, metric_rows
+from coim.run_folder import DESIGNS, EVALUATIONS, EXPECTED, METRICS, Row, design_rows, evaluation_rows, metric_rows
 from coim.tables import Layout, entry_of_column, read_columns, read_table, same_columns
 
 
@@ -54,7 +54,9 @@ class Results:
         notes: Mapping[str, Any] | None = None,
     ) -> None:
         self.folder = folder
-        self._predicted: Sequence[float | None] = notes["predicted"] if notes else []
+        # What was said of the design before it was built, by column of designs.csv.
+        columns = ("predicted", *(EXPECTED if settings.chosen_by != "value" else ()))
+        self._told: dict[str, list[float | None]] = {name: notes[name] if notes else [] for name in columns}
         self._seconds = self._seconds_before = notes["seconds"] if notes else 0.0
         rows = notes["rows"] if notes else {}
         if settings.resume is None:
@@ -65,7 +67,7 @@ class Results:
             note_resumption(folder, settings)
         self._design_names = design_names
         self._evaluations = self._table(EVALUATIONS, keep=rows.get("evaluations"))
-        self._designs = self._table(DESIGNS, keep=rows.get("designs"))
+        self._designs = self._table(DESIGNS, columns[1:], keep=rows.get("designs"))
         self._metrics: Table | None = None  # its columns are known when the first episode is done
         self._metrics_rows = rows.get("metrics", 0)
 
@@ -81,13 +83,14 @@ class Results:
         """Append the rows of one event; ``seconds`` is the wall-clock since this process took the run up."""
         seconds = self._seconds = self._seconds_before + seconds
         if isinstance(event, DesignChosen):
-            nothing = [None] * len(event.design)
-            self._predicted = nothing if event.predicted is None else event.predicted.tolist()
+            for name in self._told:
+                values = getattr(event, name)
+                self._told[name] = [None] * len(event.design) if values is None else values.tolist()
         elif isinstance(event, EpisodeDone):
             self._evaluations.append(evaluation_rows(event, self._design_names, seconds))
             self._write_metrics(metric_rows(event))
         else:
-            self._designs.append(design_rows(event, self._design_names, self._predicted))
+            self._designs.append(design_rows(event, self._design_names, self._told))
 
     def _write_metrics(self, rows: Sequence[Row]) -> None:
         """Append what was measured while learning."""
@@ -104,7 +107,7 @@ class Results:
             "designs": self._designs.num_rows,
             "metrics": self._metrics_rows,
         }
-        return {"rows": rows, "predicted": list(self._predicted), "seconds": self._seconds}
+        return {"rows": rows, **{name: list(values) for name, values in self._told.items()}, "seconds": self._seconds}
 
     def table(self) -> str:
         """The designs and their best returns, for a terminal."""

@@ -133,6 +133,11 @@ class Settings:
     """State under the design that Eq. 5 asks about: stored or matched, as in --imagined-states."""
     value_over: Literal["start", "visited"] = "start"
     """States in the mean of Eq. 5: states at the start of episodes (the paper), or all states visited."""
+    chosen_by: Literal["value", "returns", "posterior"] = "value"
+    """What the search maximises: Eq. 5 (the paper), a Gaussian process over the returns earned so far, or the same with
+    Eq. 5 as its mean."""
+    reach: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Search only this far around the best body so far, as a share of each entry's range; by default everywhere."""
 
     # -- this machine -------------------------------------------------------------------------------------------------
     precision: Literal["float32", "bfloat16"] = "float32"

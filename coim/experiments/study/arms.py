@@ -167,6 +167,47 @@ ARMS = by_name(
         colour=GREEN,
         marker="P",
     ),
+    Arm(
+        name="matched",
+        words="imagines nothing and asks Eq. 5 about start states that the body can be in",
+        settings={"imagine": "none", "value_states": "matched"},
+        baselines=("none", "random-bodies"),
+        family="bodies",
+        colour=ORANGE,
+        marker="X",
+    ),
+    Arm(
+        name="visited",
+        words="imagines nothing and asks Eq. 5 about visited states, put under the body",
+        settings={"imagine": "none", "value_states": "matched", "value_over": "visited"},
+        baselines=("none", "random-bodies"),
+        family="bodies",
+        colour=PURPLE,
+        marker="d",
+    ),
+    Arm(
+        name="returns",
+        words="imagines nothing and searches a Gaussian process over the returns earned: Bayesian optimisation",
+        settings={"imagine": "none", "chosen_by": "returns"},
+        baselines=("none", "random-bodies"),
+        family="bodies",
+        colour=VERMILION,
+        marker="h",
+    ),
+    Arm(
+        name="grounded",
+        words="imagines nothing and searches the same process with Eq. 5 over visited states as its mean",
+        settings={
+            "imagine": "none",
+            "chosen_by": "posterior",
+            "value_states": "matched",
+            "value_over": "visited",
+        },
+        baselines=("none", "random-bodies", "returns"),
+        family="bodies",
+        colour=BLACK,
+        marker="p",
+    ),
 )
 
 

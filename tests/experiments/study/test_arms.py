@@ -64,7 +64,10 @@ def test_an_arm_without_a_style_and_an_arm_that_nobody_knows_are_errors(tmp_path
         ({"name": "Made_Up"}, "'Made_Up' must be named by lower-case words"),
         ({"baselines": ("nobody",)}, "baselines of arm made-up are no other arms: nobody"),
         ({"colour": ARMS["known"].colour}, "known and made-up look alike"),
-        ({"colour": ARMS["none"].colour, "family": "bodies"}, "none and made-up look alike"),  # its baseline
+        (
+            {"colour": ARMS["none"].colour, "family": "bodies", "baselines": ("none",)},
+            "none and made-up look alike",
+        ),  # its baseline
         ({"colour": ARMS["random-bodies"].colour, "marker": "P"}, "made-up look alike"),
         ({"name": "known"}, "two have the same name"),
     ],
