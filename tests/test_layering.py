@@ -25,9 +25,8 @@ RANKS |= {name: 2 for name in ("governor", "imagined_replay", "posterior_choice"
 RANKS |= {"experiments": 3}
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
 HOMES |= {name: "designs" for name in ("botorch", "gpytorch", "linear_operator")}
-HOMES |= {
-    name: "experiments" for name in ("wandb", "tyro", "matplotlib", "imageio", "argparse", "ray", "pandas", "pydantic")
-}
+OF_EXPERIMENTS = ("wandb", "tyro", "matplotlib", "imageio", "jinja2", "argparse", "ray", "pandas", "pydantic")
+HOMES |= dict.fromkeys(OF_EXPERIMENTS, "experiments")
 REFUSED = {"utils", "common", "core", "helpers", "misc", "trainers"}
 DYNAMIC_IMPORTS = {"importlib.import_module", "import_module", "__import__"}
 FUNCTIONAL_MAY_IMPORT = {"torch", "__future__", "typing", "math"}

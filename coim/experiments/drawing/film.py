@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import imageio.v2 as imageio
 import numpy as np
@@ -43,13 +43,13 @@ class Take:
 
     Attributes:
         tried: the design.
-        policy: who moves it.
-        entries: of the design, by their names.
-        camera: in front of its body.
+        policy: the policy that drives it.
+        entries: entries of the design, with their names.
+        camera: camera in front of its body.
         poses: joint positions before each step and after the last, ``[T + 1, nq]``.
         speed: along x in m/s, ``[T + 1]``.
         returned: rewards so far, ``[T + 1]``.
-        step_seconds: what a step takes in the simulated world.
+        step_seconds: simulated time of a step, s.
     """
 
     tried: TriedDesign
@@ -62,7 +62,7 @@ class Take:
     step_seconds: float
 
     def frames(self, stride: int) -> Iterator[np.ndarray]:
-        """Every so many steps a labelled picture, ``[height, width, 3]`` uint8."""
+        """A labelled picture at every ``stride``-th step, ``[height, width, 3]`` uint8."""
         with self.camera:
             for t in range(0, len(self.poses), stride):
                 time, speed = t * self.step_seconds, round(self.speed[t], 2) + 0.0  # no "-0.00"
@@ -87,18 +87,18 @@ def film(
     width: int,
     height: int,
 ) -> Iterator[Path]:
-    """Write the films that are asked for, one after the other.
+    """Write films, one after the other.
 
     Args:
-        folder: of a run.
+        folder: a run folder.
         design: ``best``, ``top5``, ``all``, or a number from 1.
-        run: one of K; None takes the one with the best return of what is asked for.
-        steps: to show; None shows the run's whole episode.
-        policy: that of each design's best evaluation, or the population's.
+        run: one of the K runs; None takes the one that has the best return on these designs.
+        steps: number of steps to show; None shows the whole episode.
+        policy: the policy of each design's best evaluation, or the population's.
         body: class of the body, ``module:Class``; None takes the one that the run's environment names.
-        out: folder for the films; None takes ``videos/`` of the run's.
-        width: pixels of one picture.
-        height: likewise.
+        out: folder for the films; None takes ``videos/`` in the run folder.
+        width: width of one picture in pixels.
+        height: height of one picture in pixels.
 
     Yields:
         Each film, when it is written.
@@ -106,7 +106,7 @@ def film(
     Raises:
         ValueError: if there is no such run, design, policy or body, or a size cannot be filmed.
         OSError: if a film cannot be written.
-        RuntimeError: if there is nothing to draw with; the sentence says what to install and set.
+        RuntimeError: if this machine has no OpenGL; the message says what to install and set.
     """
     for name, value in (("width", width), ("height", height)):
         if value < 32 or value % 2:
@@ -124,18 +124,22 @@ def film(
         loaded.bodies.episode_steps = steps
     together = [chosen] if design == "top5" else [[tried] for tried in chosen]
     for designs in together:
-        parts = ["top5" if design == "top5" else f"design-{designs[0].number}"]
+        words = ["top5" if design == "top5" else f"design-{designs[0].number}"]
         if loaded.bodies.numel() > 1:
-            parts.insert(0, f"run-{designs[0].run}")
+            words.insert(0, f"run-{designs[0].run}")
         if policy == "population":
-            parts.append(policy)
-        path = (out or folder / "videos") / f"{'-'.join(parts)}.mp4"
+            words.append(policy)
+        path = (out or folder / "videos") / f"{'-'.join(words)}.mp4"
         write_film(path, [take(loaded, tried, policy, width, height) for tried in designs])
         yield path
 
 
 def opened(folder: Path, body: str | None) -> SavedRun:
-    """A run's folder; that its body is not known is told with the option that names one."""
+    """Open a run folder.
+
+    Raises:
+        ValueError: if its body is unknown; the message names the option that says which class it is.
+    """
     environment = read_config(folder)["environment"]
     if body is None and environment not in BODIES:
         raise ValueError(
@@ -146,17 +150,25 @@ def opened(folder: Path, body: str | None) -> SavedRun:
 
 
 def refuse_lost_policies(folder: Path, chosen: Sequence[TriedDesign]) -> None:
-    """Say of designs whose policy was not kept, or was not copied, what can be filmed in its place."""
+    """Refuse designs whose policy is not in the folder.
+
+    Raises:
+        ValueError: with the designs, and the policy that can be filmed instead.
+    """
     lost = sorted({tried.number for tried in chosen if not policy_path(folder, tried.number).is_file()})
     if lost:
         raise ValueError(
-            f"{folder} keeps no policy of design {', '.join(map(str, lost))}; to film the one that serves every design "
-            "add --policy population"
+            f"{folder} keeps no policy of design {', '.join(map(str, lost))}; add --policy population to film the "
+            "population's policy, which serves every design"
         )
 
 
 def choose(loaded: SavedRun, design: str, run: int | None) -> list[TriedDesign]:
-    """The designs that are asked for, all of one run; the best come first in ``top5``."""
+    """The designs to film, all from one run; ``top5`` has the best first.
+
+    Raises:
+        ValueError: if the run folder has no such design with a return.
+    """
     ranked = sorted(
         (tried for tried in loaded.designs if math.isfinite(tried.best_return) and run in (None, tried.run)),
         key=lambda tried: -tried.best_return,
@@ -214,7 +226,7 @@ def take(loaded: SavedRun, tried: TriedDesign, policy: PolicyName, width: int, h
 
 
 def write_film(path: Path, takes: Sequence[Take]) -> None:
-    """Film one episode, or several beside each other, at the speed at which they happened."""
+    """Film one episode, or several beside each other, in real time."""
     step_seconds = takes[0].step_seconds
     stride = max(1, math.ceil(1 / (FRAMES_PER_SECOND * step_seconds)))
     rate, total = 1 / (stride * step_seconds), math.ceil(len(takes[0].poses) / stride)
@@ -223,14 +235,15 @@ def write_film(path: Path, takes: Sequence[Take]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with (
             written_aside(path) as aside,
-            imageio.get_writer(aside, fps=rate, codec="libx264", quality=8, macro_block_size=2) as writer,
+            imageio.get_writer(aside, fps=rate, codec="libx264", quality=8, macro_block_size=2) as opened_file,
         ):
+            writer: Any = opened_file  # imageio types it as a reader or a writer
             for pictures in counted(together, total, f"{path.name}: pictures"):
                 writer.append_data(side_by_side(pictures))
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures of one size in lines of equal length, from left to right and from above; white where there is none."""
+    """Pictures of one size in lines of equal length, from left to right and top to bottom, filled up with white."""
     if len(pictures) == 1:
         return pictures[0]
     columns = math.ceil(math.sqrt(len(pictures)))
@@ -245,9 +258,9 @@ def labelled(picture: np.ndarray, lines: Sequence[str], entries: Sequence[str] =
 
     Args:
         picture: ``[height, width, 3]`` uint8.
-        lines: of text.
-        entries: words that go below them, as many in a line as it can hold; none where all of them would take too much
-            of the picture.
+        lines: lines of text.
+        entries: words below them, as many in a line as fit; left out if all of them would cover too much of the
+            picture.
     """
     size = max(LEAST_TEXT, picture.shape[0] // TEXT_SHARE)
     image = Image.fromarray(picture)

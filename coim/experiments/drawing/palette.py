@@ -1,14 +1,15 @@
 """Colours, shapes and legends of all pictures.
 
-Okabe and Ito's palette: its contrasts survive the common kinds of colour blindness. Shapes and dashes tell things apart
-too, on paper without colours.
+The palette is Okabe and Ito's; people with the common kinds of colour blindness can tell its colours apart. Marks and
+dashes differ too, for paper without colours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -16,12 +17,17 @@ BLACK, GREY, LIGHT = "#000000", "#999999", "#E0E0E0"
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 
 KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s"), "fixed": (ORANGE, "D")}
-Dashes = (
-    str | tuple[float, tuple[float, ...]]
-)  # matplotlib's line style; a tuple is an offset, then line and gap lengths
+# A line style of matplotlib; a tuple is an offset, then lengths of lines and gaps.
+Dashes = str | tuple[float, tuple[float, ...]]
 DASHES: tuple[Dashes, ...] = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (6, 1, 1, 1)))
 CHARACTERS = 120  # that fit side by side in a legend over the page's width
-CIRCLE = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "magenta", "markeredgewidth": 2}  # as Fig. 4
+# The circle of Fig. 4.
+CIRCLE: dict[str, Any] = {
+    "markersize": 9,
+    "markerfacecolor": "none",
+    "markeredgecolor": "magenta",
+    "markeredgewidth": 2,
+}
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
 
@@ -33,12 +39,12 @@ def style_of(index: int, count: int) -> dict[str, Any]:
 
 
 def literal(name: str) -> str:
-    """A folder's name as matplotlib draws it as it is: no formula between dollars, no underscore that hides it."""
+    """A folder's name that matplotlib draws literally: no formula between dollars, not hidden by an underscore."""
     return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
 
 def kind_handles(kinds: Iterable[str], colour: str | None = None) -> list[Line2D]:
-    """Entries of a legend for kinds of design; ``colour`` overrules the kind's own."""
+    """Legend entries for kinds of design, in ``colour`` or each kind's own colour."""
     there = set(kinds)
     return [
         Line2D([], [], color=colour or own, marker=marker, linestyle="", label=f"{kind} design")
@@ -47,8 +53,8 @@ def kind_handles(kinds: Iterable[str], colour: str | None = None) -> list[Line2D
     ]
 
 
-def put_legend(figure: Figure, handles: list[Line2D]) -> None:
-    """A legend above a figure, in as many columns as its words leave room for."""
+def put_legend(figure: Figure, handles: Sequence[Artist]) -> None:
+    """Put a legend above a figure, in as many columns as fit."""
     if handles:
         longest = max(len(str(handle.get_label())) for handle in handles)
         columns = max(1, min(len(handles), CHARACTERS // (longest + 8)))

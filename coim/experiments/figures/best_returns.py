@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from coim.experiments.drawing.curves import draw_mean
 from coim.experiments.drawing.palette import GREY, put_legend
 from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.figures.legend import line_entries
@@ -109,10 +110,7 @@ def draw_panel(
         values = best_returns(own, longest, failure)
         value, low, high, count = over_runs(values, STATISTICS[label])
         x, shown = np.arange(1, longest + 1), count > 0
-        axes.plot(x, value, linewidth=1.6, zorder=3, marker="o" if shown.sum() == 1 else "", **arm_named(arm).line)
-        axes.fill_between(x, low, high, color=arm_named(arm).colour, alpha=0.1, linewidth=0, zorder=2)
-        for end in (low, high):
-            axes.plot(x, end, linewidth=0.5, zorder=2, **arm_named(arm).line)
+        draw_mean(axes, x, value, low, high, **arm_named(arm).line)
         head: dict[str, object] = {"environment": environment, "task": task, "arm": arm, "series": label}
         for i in np.flatnonzero(shown):
             numbers = {"best_return": value[i], "low": low[i], "high": high[i], "runs": int(count[i])}
@@ -122,7 +120,7 @@ def draw_panel(
     if axes.lines:
         axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design,\n{label} (1)")
         axes.spines[["top", "right"]].set_visible(False)
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.locator_params(axis="x", integer=True)
     return bool(axes.lines)
 
 

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import AbstractPathEffect, withStroke
+from numpy.typing import ArrayLike
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import CIRCLE
@@ -32,23 +33,23 @@ STATES = ((0.2, 0.0, 10.0), (0.2, 3.0, 0.0), (0.8, 6.0, -10.0))
 
 
 def cart_acceleration(
-    length: np.ndarray | float,
-    pole_mass: np.ndarray | float,
+    length: ArrayLike,
+    pole_mass: ArrayLike,
     *,
     angle: float,
     angular_velocity: float,
     force: float,
     cart_mass: float = CART_MASS,
-) -> np.ndarray | float:
+) -> np.ndarray:
     """Acceleration of the cart along x, without friction, in m/s^2.
 
     Args:
-        length: of the whole pole, m.
-        pole_mass: kg.
-        angle: of the pole from the vertical, rad.
-        angular_velocity: of the pole, rad/s.
-        force: on the cart, N.
-        cart_mass: kg.
+        length: length of the whole pole, m.
+        pole_mass: mass of the pole, kg.
+        angle: angle of the pole from the vertical, rad.
+        angular_velocity: angular velocity of the pole, rad/s.
+        force: force on the cart, N.
+        cart_mass: mass of the cart, kg.
 
     Example:
         >>> float(cart_acceleration(1.0, 0.1, angle=0.0, angular_velocity=0.0, force=0.0))  # upright and at rest
@@ -57,11 +58,12 @@ def cart_acceleration(
         >>> float(weightless.round(6))  # m/s^2: 10 N push 1 kg
         10.0
     """
-    half, total = np.asarray(length) / 2, cart_mass + np.asarray(pole_mass)
+    half, pole_mass = np.asarray(length) / 2, np.asarray(pole_mass)
+    total = cart_mass + pole_mass
     sine, cosine = np.sin(angle), np.cos(angle)
     push = (force + pole_mass * half * angular_velocity**2 * sine) / total
     turn = (GRAVITY * sine - cosine * push) / (half * (4 / 3 - pole_mass * cosine**2 / total))
-    return (push - pole_mass * half * turn * cosine / total)[()]
+    return np.asarray(push - pole_mass * half * turn * cosine / total)
 
 
 def plots(study: Path) -> Iterator[Plot]:
@@ -96,7 +98,8 @@ def draw(axes: Axes, lengths: np.ndarray, masses: np.ndarray, acceleration: np.n
     """One state: colours, lines with numbers, the original body."""
     axes.pcolormesh(lengths, masses, acceleration, cmap="cividis", shading="gouraud", rasterized=True)
     lines = axes.contour(lengths, masses, acceleration, levels=8, colors="white", linewidths=0.7)
-    around = [withStroke(linewidth=2.5, foreground="black")]  # white alone is lost on the bright end of the colours
+    # White alone is lost on the bright end of the colours.
+    around: list[AbstractPathEffect] = [withStroke(linewidth=2.5, foreground="black")]
     for label in axes.clabel(lines, fontsize=7, fmt="%g", inline=False):
         label.set_path_effects(around)
         x, y = (axes.transData + axes.transAxes.inverted()).transform(label.get_position())

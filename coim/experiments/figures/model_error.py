@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.curves import draw_mean, draw_runs
+from coim.experiments.drawing.layout import STEPS, new_figure
 from coim.experiments.drawing.palette import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, put_legend
 from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.frames import read_frame, rows_of
@@ -34,7 +36,6 @@ from coim.experiments.model_error.tables import (
     name_of,
     with_shares,
 )
-from coim.experiments.report.curves import STEPS
 from coim.experiments.statistics.intervals import RESAMPLES
 from coim.run_folder import read_config
 
@@ -112,18 +113,11 @@ def draw(axes: Axes, rows: pd.DataFrame, model: str, unit: str) -> None:
     """
     for probe, (colour, dashes, mark, _) in PROBES.items():
         found = errors(rows, probe, model, unit)
-        style = {"color": colour, "linestyle": dashes or "none"}
-        for run in found.y if len(found.y) > 1 else ():
-            there = np.isfinite(run)
-            faint = style | {"marker": mark, "markersize": 2.5, "linewidth": 0.6, "alpha": 0.25, "zorder": 1}
-            axes.plot(found.x[there], run[there], label=f"_{probe}", **faint)
+        style: dict[str, Any] = {"color": colour, "linestyle": dashes or "none", "marker": mark}
+        if len(found.y) > 1:
+            draw_runs(axes, found.x, found.y, label=f"_{probe}", markersize=2.5, **style)
         x, value, low, high, _ = mean_error(rows, probe, model, unit)
-        lone = mark or ("o" if len(x) == 1 else "")
-        axes.plot(x, value, label=probe, marker=lone, markersize=4, linewidth=1.3, zorder=3, **style)
-        if mark:
-            axes.vlines(x, low, high, color=colour, linewidth=0.8, zorder=2)
-        else:
-            axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0, zorder=2)
+        draw_mean(axes, x, value, low, high, label=probe, markersize=4, linewidth=1.3, **style)
     if unit == "share":
         axes.axhline(1, label="no change", color=GREY, linestyle="--", linewidth=1)
     axes.set(yscale="log")
@@ -138,7 +132,8 @@ def handles(measured: set[str]) -> Iterator[Line2D]:
     """Entries of the legend for what was measured."""
     for probe, (colour, dashes, mark, words) in PROBES.items():
         if probe in measured:
-            yield Line2D([], [], color=colour, linestyle=dashes or "none", marker=mark, markersize=4, label=words)
+            style: dict[str, Any] = {"linestyle": dashes or "none", "marker": mark}
+            yield Line2D([], [], color=colour, markersize=4, label=words, **style)
     yield Line2D([], [], color=GREY, linestyle="--", linewidth=1, label="predicting no change")
 
 
@@ -205,11 +200,12 @@ def notes(rows: pd.DataFrame, folders: Sequence[Path]) -> list[str]:
 
 def late_shares(rows: pd.DataFrame) -> list[dict[str, object]]:
     """Share of the change that is not explained at the end of training, for all that was measured by each model."""
-    table = []
+    table: list[dict[str, object]] = []
     for probe, (*_, words) in PROBES.items():
         found = {model: late_share(rows, probe, model) for model in MODELS}
         if any(np.isfinite(value) for value, _, _ in found.values()):
-            table.append({"transitions": words} | {MODELS[model]: in_words(*share) for model, share in found.items()})
+            row: dict[str, object] = {"transitions": words}
+            table.append(row | {MODELS[model]: in_words(*share) for model, share in found.items()})
     return table
 
 

@@ -21,8 +21,8 @@ from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import CHOSEN, Runs, read_runs
 
 DESIGNS, TESTS = "figure_2_retrained", "figure_2_tests"
-TESTS_SHOWN = ("environment", "task", "arm", "against", "designs", "runs")
-TESTS_SHOWN += ("difference", "welch_designs_p", "welch_runs_p", "welch_runs_p_holm")
+TESTS_SHOWN = ["environment", "task", "arm", "against", "designs", "runs"]
+TESTS_SHOWN += ["difference", "welch_designs_p", "welch_runs_p", "welch_runs_p_holm"]
 
 
 def plots(study: Path) -> Iterator[Plot]:
@@ -173,8 +173,9 @@ def draw_differences(axes: Axes, rows: Sequence[Cells]) -> None:
     """One environment and task; the first pair on top."""
     for y, row in enumerate(reversed(rows)):
         arm = arm_named(str(row["arm"]))
-        axes.plot([row["difference_low"], row["difference_high"]], [y, y], linewidth=2, color=arm.colour)
-        axes.plot(row["difference"], y, **arm.point)
+        difference, low, high = (float(str(row[f"difference{end}"])) for end in ("", "_low", "_high"))
+        axes.plot([low, high], [y, y], linewidth=2, color=arm.colour)
+        axes.plot(difference, y, **arm.point)
     axes.axvline(0, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
     labels = ["{arm} minus {against}".format(**row) for row in reversed(rows)]
     axes.set(ylim=(-0.7, len(rows) - 0.3), yticks=range(len(rows)), yticklabels=labels)

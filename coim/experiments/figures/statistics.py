@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,10 +26,10 @@ ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not."
 OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
 INTERVALS = f"Intervals are {CONFIDENCE:.0%} percentile bootstraps over runs ({RESAMPLES} resamples)."
 AREA = "area: the mean over designs of the best return of a design. final: the highest best return of all designs."
-ARMS_SHOWN = ("environment", "task", "arm", "planned", "over", "diverged")
-ARMS_SHOWN += ("area_iqm", "final_iqm", "search_gain", "rank_correlation_given_order")
-PAIRS_SHOWN = ("environment", "task", "measure", "arm", "against", "difference", "improvement")
-PAIRS_SHOWN += ("welch_p_holm", "paired_p_holm", "detectable")
+ARMS_SHOWN = ["environment", "task", "arm", "planned", "over", "diverged"]
+ARMS_SHOWN += ["area_iqm", "final_iqm", "search_gain", "rank_correlation_given_order"]
+PAIRS_SHOWN = ["environment", "task", "measure", "arm", "against", "difference", "improvement"]
+PAIRS_SHOWN += ["welch_p_holm", "paired_p_holm", "detectable"]
 
 
 def plots(study: Path) -> Iterator[Plot]:
@@ -123,8 +124,12 @@ def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: pd.Data
 
 def name_arms(axes: Axes, arms: Sequence[str]) -> None:
     """Names below the columns: side by side, slanted or upright, as there is room for them."""
-    turned = {"rotation": angle, "ha": "right", "rotation_mode": "anchor"} if (angle := angle_of_names(arms)) else {}
-    axes.set_xticks(range(len(arms)), arms, **({"va": "center"} if angle == 90 else {}) | turned)
+    turned: dict[str, Any] = {}
+    if angle := angle_of_names(arms):
+        turned = {"rotation": angle, "ha": "right", "rotation_mode": "anchor"}
+    if angle == 90:
+        turned["va"] = "center"
+    axes.set_xticks(range(len(arms)), arms, **turned)
 
 
 def angle_of_names(arms: Sequence[str]) -> int:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import matplotlib as mpl
 
+from coim.experiments.drawing.layout import FONT
 from coim.experiments.figures import best_returns as returns
 from coim.experiments.figures import cartpole, design_space, model_error, retrained, statistics
 from coim.experiments.figures.figure import Plot
 from coim.experiments.model_error.tables import FOLDER
-from coim.experiments.report.page import FONT
 from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, written_aside
 from coim.experiments.run.progress import counted
 from coim.experiments.run.records import number

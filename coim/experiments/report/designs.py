@@ -4,42 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from coim.envs import MorphEnv
 from coim.experiments.drawing.bodies import BODIES_IN_A_LINE, draw_lines_of_bodies
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import GREY, literal, style_of
 from coim.experiments.frames import designs_of, spearman
-from coim.experiments.report.curves import cross_handles, explain, mark_kinds, plot_over_designs
+from coim.experiments.report.axes import cross_handles, explain, mark_kinds, plot_over_designs
+from coim.experiments.report.page import Section
 from coim.experiments.run.records import Record, number
 
 MOST_BODIES = 64  # of one run; of more the best are drawn
 BODIES_COMPARED = 5
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A figure of the page.
-
-    Attributes:
-        title: of its section.
-        caption: what is seen, in a sentence or two.
-        alt: the same in numbers, for who cannot see it.
-        figure: None where there is nothing to draw; the caption then says why.
-    """
-
-    title: str
-    caption: str
-    alt: str = ""
-    figure: Figure | None = field(default=None)
-
-
-def best_returns(records: Sequence[Record]) -> Picture:
+def best_returns(records: Sequence[Record]) -> Section:
     """Best return of each design, in the order in which they were built."""
     figure, (axes,) = new_figure(3.4)
     plot_over_designs(axes, records, "best_return")
@@ -51,10 +34,15 @@ def best_returns(records: Sequence[Record]) -> Picture:
         if len(r.best)
     ]
     caption = "Highest return of the deterministic policy on each body, in the order in which they were built."
-    return Picture("Best return of each design", caption, "Best return over designs. " + "; ".join(tops), figure)
+    return Section(
+        title="Best return of each design",
+        figure=figure,
+        caption=caption,
+        alt="Best return over designs. " + "; ".join(tops),
+    )
 
 
-def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
+def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) -> Section:
     """Each design dimension over the order of building."""
     names = records[0].design_names
     size = len(names)
@@ -80,14 +68,16 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
         "" if body is None else f" Dashed: the bounds, {body.DESIGN_BOUNDS[0]:.3g} and {body.DESIGN_BOUNDS[1]:.3g}."
     )
     caption = f"Scale factors of the body, 1 as drawn.{bounds}"
-    return Picture("Designs over time", caption, f"Scale factors over designs: {', '.join(names)}.{bounds}", figure)
+    alt = f"Scale factors over designs: {', '.join(names)}.{bounds}"
+    return Section(title="Designs over time", figure=figure, caption=caption, alt=alt)
 
 
-def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
+def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Section:
     """The bodies of one run, or the best of each folder."""
     title = "Bodies"
     if body is None:
-        return Picture(title, f"{records[0].environment} is no environment of coim: its bodies are not drawn.")
+        note = f"{records[0].environment} is no environment of coim: its bodies are not drawn."
+        return Section(title=title, notes=[note])
     shown: list[tuple[str, pd.DataFrame]] = []
     for record in records:
         if len(record.best):
@@ -97,7 +87,7 @@ def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
             best = ranked.tail(MOST_BODIES if len(records) == 1 else BODIES_COMPARED)
             shown.append((f"{literal(record.name)}, run {run}", best.sort_values("design")))
     if not shown:
-        return Picture(title, "No design has a return yet.")
+        return Section(title=title, notes=["No design has a return yet."])
     caption = (
         "Bodies at rest, to one scale, in the order in which they were built; below each its number and best return."
     )
@@ -115,29 +105,37 @@ def bodies(records: Sequence[Record], body: type[MorphEnv] | None) -> Picture:
         for _, rows in shown
         for design, best in zip(rows["design"], rows["best_return"])
     )
-    return Picture(title, caption, f"Bodies with their best returns. {numbers}", draw_lines_of_bodies(shown, body))
+    alt = f"Bodies with their best returns. {numbers}"
+    return Section(title=title, figure=draw_lines_of_bodies(shown, body), caption=caption, alt=alt)
 
 
-def predictions(records: Sequence[Record]) -> Picture:
+def predictions(records: Sequence[Record]) -> Section:
     """Eq. 5 before a body was built against the best return on it."""
     title = "Predicted and achieved"
     figure, (axes,) = new_figure(3.6)
     found = []
     for index, record in enumerate(records):
-        known = np.isfinite(record.designs[["best_return", "predicted"]].to_numpy()).all(axis=1)
+        known = np.isfinite(record.designs[["best_return", "predicted"]].to_numpy()).all(1)
         rows = record.designs[record.designs["finished"] & known]
         colour = style_of(index, len(records))["color"] if len(records) > 1 else None
         mark_kinds(axes, rows, "best_return", colour, x="predicted")
         found.append((f"{record.name}: " if colour else "") + describe_correlation(rows))
     if not axes.collections:
-        return Picture(title, "No design has both a prediction and a return yet: the first is built without one.")
+        note = "No design has both a prediction and a return yet: the first is built without one."
+        return Section(title=title, notes=[note])
     axes.set(xlabel=r"predicted value $Q(\xi)$ before the body was built, discounted (1)", ylabel="best return (1)")
     explain(figure, records, kinds=True, mean=False)
     caption = (
         "Eq. 5 before anything was learnt on a body, against the best return on it. The scales differ (discounted "
+        "value of the population, return of an episode); the order counts."
     )
-    caption += "value of the population, return of an episode); the order counts. " + "; ".join(found) + "."
-    return Picture(title, caption, "Predicted value against best return. " + "; ".join(found), figure)
+    return Section(
+        title=title,
+        figure=figure,
+        caption=caption,
+        alt="Predicted value against best return. " + "; ".join(found),
+        notes=[f"{words}." for words in found],
+    )
 
 
 def describe_correlation(rows: pd.DataFrame) -> str:
@@ -157,4 +155,4 @@ def describe_correlation(rows: pd.DataFrame) -> str:
 
 def _top(record: Record) -> pd.Series:
     """The best design of all runs; its name is the number of its run."""
-    return record.best.iloc[record.best["best_return"].argmax()]
+    return record.best.iloc[int(record.best["best_return"].argmax())]

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.layout import STEPS, new_figure
 from coim.experiments.drawing.palette import BLACK, BLUE, GREY, SKY, style_of
 from coim.experiments.frames import curves
-from coim.experiments.report.curves import (
-    STEPS,
+from coim.experiments.report.axes import (
     cross_handles,
     episodes_in_a_point,
     explain,
@@ -24,7 +24,7 @@ from coim.experiments.report.curves import (
     plot_over_steps,
     points_in_words,
 )
-from coim.experiments.report.designs import Picture
+from coim.experiments.report.page import Section
 from coim.experiments.run.records import Record, number
 from coim.pairs import IN_THE_FLOOR
 
@@ -36,7 +36,7 @@ LOSSES = {  # column of metrics.csv behind the learner's name, and the words bes
 }
 
 
-def learning_curves(records: Sequence[Record]) -> Picture:
+def learning_curves(records: Sequence[Record]) -> Section:
     """Return over training steps."""
     figure, (axes,) = new_figure(3.4)
     caption = "Return of the deterministic policy after each training episode."
@@ -55,18 +55,23 @@ def learning_curves(records: Sequence[Record]) -> Picture:
         mark_divergences(axes, record.diverged, "env_steps", "return")
     axes.set(xlabel=f"{STEPS} (1)", ylabel="return of an episode (1)")
     last = [f"{r.name}: {curves(r.episodes, 'env_steps', 'return').mean[-1:].round(2).tolist()}" for r in records]
-    caption += points_in_words(records)
-    return Picture("Learning curves", caption, "Return over training steps. Last mean: " + "; ".join(last), figure)
+    return Section(
+        title="Learning curves",
+        figure=figure,
+        caption=caption,
+        alt="Return over training steps. Last mean: " + "; ".join(last),
+        notes=points_in_words(records),
+    )
 
 
-def model_errors(records: Sequence[Record]) -> Picture:
+def model_errors(records: Sequence[Record]) -> Section:
     """How well the ensemble foresaw each new episode, and what it was asked about."""
     title = "Model error over time"
     figure, (axes, below) = new_figure(4.6, 2, 1, sharex=True)
     if len(records) == 1:
         mark_builds(axes, records[0])
     if not plot_over_steps(axes, records, "model_error"):
-        return Picture(title, "No model was learnt.")
+        return Section(title=title, notes=["No model was learnt."])
     axes.set(ylabel="squared error over\nvariance of changes (1)", yscale="log")
     low, high = axes.get_ylim()
     axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=LogLocator(subs=(3, 4, 6, 7, 8, 9)))
@@ -76,8 +81,8 @@ def model_errors(records: Sequence[Record]) -> Picture:
     explain(figure, records)
     caption = (
         "Squared error of the model's means on each new episode before learning from it, in units of the variance of "
+        "one-step changes. Dashed: as good as predicting that nothing changes."
     )
-    caption += "one-step changes. Dashed: as good as predicting that nothing changes." + points_in_words(records)
     if plot_over_steps(below, records, "impossible"):
         below.set(xlabel=f"{STEPS} (1)", ylabel="shares (1)", ylim=(-0.02, 1.02))
         caption += f" Below: share of imagined pairs with over {100 * IN_THE_FLOOR:.0f} cm of the body in the floor."
@@ -88,10 +93,16 @@ def model_errors(records: Sequence[Record]) -> Picture:
         axes.set(xlabel=f"{STEPS} (1)")
         axes.tick_params(labelbottom=True)
     ends = [f"{r.name}: {m[0]:.3g} to {m[-1]:.3g}" for r in records if (m := _means(r, "model_error")).size]
-    return Picture(title, caption, "Model error over training steps. " + "; ".join(ends), figure)
+    return Section(
+        title=title,
+        figure=figure,
+        caption=caption,
+        alt="Model error over training steps. " + "; ".join(ends),
+        notes=points_in_words(records),
+    )
 
 
-def losses(records: Sequence[Record]) -> Picture:
+def losses(records: Sequence[Record]) -> Section:
     """Losses of both learners and of the model, and the entropy term."""
     title = "Losses and entropy"
     weighted = [_with_weighted_entropy(record) for record in records]
@@ -111,53 +122,58 @@ def losses(records: Sequence[Record]) -> Picture:
         axes.set_visible(there)
         drawn |= there
     if not drawn:
-        return Picture(title, "The folder has no metrics.csv, or it has no rows: losses are not known.")
-    grey = {"color": BLACK if alone else GREY}
+        return Section(title=title, notes=["The folder has no metrics.csv, or it has no rows: losses are not known."])
+    grey: dict[str, Any] = {"color": BLACK if alone else GREY}
     lines = [Line2D([], [], label=f"{who} learner", **grey | style) for who, style in learners.items()]
     explain(figure, records, mean=False, more=lines)
-    caption = (
-        "Means over the updates after each episode, of the learners' losses and of the model's."
-        + points_in_words(records)
-    )
+    caption = "Means over the updates after each episode, of the learners' losses and of the model's."
     caption += " Faint lines: single runs." if alone and records[0].num_runs > 1 else ""
-    return Picture(
-        title, caption, "Actor loss, critic loss, weighted entropy and model loss over training steps.", figure
+    return Section(
+        title=title,
+        figure=figure,
+        caption=caption,
+        alt="Actor loss, critic loss, weighted entropy and model loss over training steps.",
+        notes=points_in_words(records),
     )
 
 
-def times(records: Sequence[Record]) -> Picture:
+def times(records: Sequence[Record]) -> Section:
     """Where the wall-clock went."""
     title = "Time spent"
-    spent = [time_by_part(record) for record in records]
-    parts = sorted({part for found in spent for part in found}, key=lambda part: -max(f.get(part, 0.0) for f in spent))
-    if not parts:
-        return Picture(title, "The folder has no metrics.csv, or it has no rows: times are not known.")
-    figure, (axes,) = new_figure(0.9 + 0.22 * len(parts) * (1 + len(records)))
+    spent = [seconds_of_activities(record) for record in records]
+    activities = sorted(
+        {activity for found in spent for activity in found}, key=lambda name: -max(f.get(name, 0.0) for f in spent)
+    )
+    if not activities:
+        return Section(title=title, notes=["The folder has no metrics.csv, or it has no rows: times are not known."])
+    figure, (axes,) = new_figure(0.9 + 0.22 * len(activities) * (1 + len(records)))
     height = 0.8 / len(records)
     for index, found in enumerate(spent):
-        places = np.arange(len(parts)) + (index + 0.5) * height - 0.4
-        minutes = [found.get(part, 0.0) / 60 for part in parts]
+        places = np.arange(len(activities)) + (index + 0.5) * height - 0.4
+        minutes = [found.get(activity, 0.0) / 60 for activity in activities]
         bars = axes.barh(
             places, minutes, height, color=BLUE if len(records) == 1 else style_of(index, len(records))["color"]
         )
         axes.bar_label(bars, [f"{value:.2g}" if value < 1 else number(value, 3) for value in minutes], padding=3)
-    axes.set_yticks(range(len(parts)), parts)
+    axes.set_yticks(range(len(activities)), activities)
     axes.invert_yaxis()
     axes.set(xlabel="wall-clock (min)")
     axes.margins(x=0.12)
     if len(records) > 1:
         explain(figure, records)
-    caption = "Wall-clock by part, all runs of a folder together. Learners that train side by side overlap; "
-    caption += "'between episodes' holds the design search."
+    caption = (
+        "Wall-clock of each activity, all runs of a folder together. Learners that train side by side overlap; "
+        "'between episodes' holds the design search."
+    )
     told = [f"{r.name}: " + ", ".join(f"{p} {s / 60:.3g} min" for p, s in f.items()) for r, f in zip(records, spent)]
-    return Picture(title, caption, "Wall-clock by part. " + "; ".join(told), figure)
+    return Section(title=title, figure=figure, caption=caption, alt="Wall-clock: " + "; ".join(told))
 
 
-def time_by_part(record: Record) -> dict[str, float]:
-    """Seconds of each part over all episodes so far, and what lies between the episodes."""
+def seconds_of_activities(record: Record) -> dict[str, float]:
+    """Seconds of each activity over all episodes so far, and of what lies between the episodes."""
     rows = record.episodes.drop_duplicates(["design", "episode"], keep="last")  # the same for all runs
-    parts = {name: name.removeprefix("seconds/") for name in rows.columns if name.startswith("seconds/")}
-    totals: dict[str, float] = {part: rows[name].sum() for name, part in parts.items()}
+    columns = [name for name in rows.columns if name.startswith("seconds/")]
+    totals = {name.removeprefix("seconds/"): float(rows[name].sum()) for name in columns}
     if totals:
         totals["between episodes"] = max(0.0, rows["seconds"].iloc[-1] - totals.pop("episode", 0.0))
     return totals
@@ -165,9 +181,10 @@ def time_by_part(record: Record) -> dict[str, float]:
 
 def _with_weighted_entropy(record: Record) -> Record:
     alpha = record.settings.get("alpha", math.nan)
-    entropies = [name for name in record.episodes.columns if name.endswith("/entropy")]
-    weighted = {f"{name.removesuffix('entropy')}alpha_entropy": alpha * record.episodes[name] for name in entropies}
-    return replace(record, episodes=record.episodes.assign(**weighted))
+    rows = record.episodes
+    columns = [name for name in rows.columns if name.endswith("/entropy")]
+    weighted = {f"{name.removesuffix('entropy')}alpha_entropy": alpha * rows[name] for name in columns}
+    return replace(record, episodes=rows.assign(**weighted))
 
 
 def _means(record: Record, column: str) -> np.ndarray:

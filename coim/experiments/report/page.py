@@ -1,100 +1,99 @@
-"""One self-contained HTML page: headings, tables and figures, nothing to fetch and nothing to execute."""
+"""One self-contained HTML page made of sections: nothing to fetch and nothing to execute.
+
+``page.html`` beside this file is the template. It escapes every value.
+"""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib as mpl
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-FONT = {"font.size": 9, "axes.titlesize": 9, "legend.fontsize": 8.5, "svg.hashsalt": "coim"}
-POINTS, PIXELS = 72, 96  # of an inch
+from coim.experiments.drawing.layout import FONT
+
+PIXELS = 96  # of an inch
 RESOLUTION = 200  # of what is drawn as pixels inside of a figure, per inch
-
-STYLE = """
-body { font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; color: #111;
-       background: #fff; max-width: 56rem; margin: 0 auto; padding: 1.5rem; }
-h1 { font-size: 1.6rem; margin: 0 0 .5rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid #ccc; break-after: avoid; }
-figure { margin: 0; break-inside: avoid; }
-figure img { display: block; width: 100%; height: auto; }
-figcaption, .note { color: #444; font-size: .9rem; max-width: 46rem; }
-.note { margin: .3rem 0; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; vertical-align: top; padding: .15rem .9rem .15rem 0; border-bottom: 1px solid #e0e0e0; }
-td { overflow-wrap: anywhere; }
-thead th { border-bottom: 2px solid #888; }
-tr { break-inside: avoid; }
-tr.differs { font-weight: 600; background: #fff3d6; }
-tr.differs th::after { content: " (differs)"; font-weight: 400; }
-section { break-inside: auto; }
-@page { size: A4; margin: 14mm; }
-@media print {
-  body { font-size: 10pt; max-width: none; padding: 0; }
-  h2 { margin: 1rem 0 .4rem; }
-  figure img { width: 86%; }
-  section.picture { break-inside: avoid; }
-  .wide { overflow: visible; }
-  tr.differs { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-}
-"""
+MOST_COLUMNS = 10  # of a table
 
 
-def page(title: str, body: Sequence[str]) -> str:
-    """A whole page around its sections."""
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{STYLE}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n"
-        + "\n".join(body)
-        + "\n</body>\n</html>\n"
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table whose first column names its rows.
+
+    Attributes:
+        head: names of the columns.
+        rows: cells, the name of the row first.
+        marked: names of rows that are set off from the others.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    marked: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A section of the page.
+
+    Attributes:
+        title: its heading.
+        figure: None where there is nothing to draw; a note then says why.
+        caption: what is drawn, in at most 60 words.
+        alt: the same in numbers, for readers who cannot see the figure.
+        notes: sentences in small print.
+        tables: any number of tables, at most ten columns each; see `narrow`.
+    """
+
+    title: str
+    figure: Figure | None = None
+    caption: str = ""
+    alt: str = ""
+    notes: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+
+
+class Svg(NamedTuple):
+    """A figure as the page holds it, with its size in pixels."""
+
+    base64: str
+    width: int
+    height: int
+
+
+def page(title: str, sections: Sequence[Section]) -> str:
+    """The whole page."""
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    return environment.get_template("page.html").render(title=title, sections=sections, svg=svg)
 
 
-def section(title: str, content: str, *, kind: str = "") -> str:
-    """A part of the page under a heading; ``kind`` is its class."""
-    return f'<section class="{kind}">\n<h2>{escape(title)}</h2>\n{content}\n</section>'
-
-
-def note(sentence: str) -> str:
-    """A sentence in small print."""
-    return f'<p class="note">{escape(sentence)}</p>'
-
-
-def image(figure: Figure, *, alt: str, caption: str) -> str:
-    """A figure with its caption; drawn as SVG, whose text is outlines, so that every browser shows the same."""
+def svg(figure: Figure) -> Svg:
+    """A figure drawn as SVG; its text is outlines, so that every browser shows the same."""
     drawn = io.BytesIO()
     with mpl.rc_context(FONT):
         figure.savefig(drawn, format="svg", dpi=RESOLUTION, metadata={"Date": None})
     width, height = (round(inches * PIXELS) for inches in figure.get_size_inches())
-    data = base64.b64encode(drawn.getvalue()).decode()
-    size = f'width="{width}" height="{height}"'
-    return (
-        f'<figure>\n<img alt="{escape(alt)}" {size} src="data:image/svg+xml;base64,{data}">\n'
-        f"<figcaption>{escape(caption)}</figcaption>\n</figure>"
-    )
+    return Svg(base64.b64encode(drawn.getvalue()).decode(), width, height)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, differing: bool = False) -> str:
-    """A table whose first column names its rows.
+def narrow(table: Table) -> Iterator[Table]:
+    """A table that fits on the page, or several with the same rows where it has too many columns.
 
-    Args:
-        head: of the columns.
-        rows: their cells.
-        differing: whether to mark the rows whose other cells are not all equal.
+    Example:
+        >>> wide = Table(head=["", *"abcdefghijk"], rows=[["row", *"0123456789X"]])
+        >>> [(len(table.head), table.rows[0][:2]) for table in narrow(wide)]
+        [(10, ['row', '0']), (3, ['row', '9'])]
     """
-    lines = []
-    for name, *cells in rows:
-        kind = ' class="differs"' if differing and len(set(cells)) > 1 else ""
-        cells = [f"<td>{escape(cell)}</td>" for cell in cells]
-        lines.append(f'<tr{kind}><th scope="row">{escape(name)}</th>{"".join(cells)}</tr>')
-    top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    return (
-        f'<div class="wide"><table>\n<thead><tr>{top}</tr></thead>\n<tbody>\n'
-        + "\n".join(lines)
-        + "\n</tbody></table></div>"
-    )
+    for start in range(1, len(table.head), MOST_COLUMNS - 1):
+        own = slice(start, start + MOST_COLUMNS - 1)
+        rows = [[name, *cells[own.start - 1 : own.stop - 1]] for name, *cells in table.rows]
+        yield Table(head=[table.head[0], *table.head[own]], rows=rows, marked=table.marked)

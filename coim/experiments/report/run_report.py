@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,10 @@ import matplotlib as mpl
 import pandas as pd
 
 from coim.envs import BODIES, MorphEnv
+from coim.experiments.drawing.layout import FONT
 from coim.experiments.frames import designs_of
-from coim.experiments.report import designs as figures
-from coim.experiments.report import learning as diagnostics
-from coim.experiments.report.designs import Picture
-from coim.experiments.report.page import FONT, image, note, page, section, table
+from coim.experiments.report import designs, learning
+from coim.experiments.report.page import Section, Table, narrow, page
 from coim.experiments.run.atomic_write import dated_file, naming_out, write_whole
 from coim.experiments.run.records import Record, number, read_records
 
@@ -41,7 +40,7 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
     records = read_records(folders)
     body = body or BODIES.get(records[0].environment)
     with mpl.rc_context(FONT):
-        sections = [in_short(records), *(show(picture) for picture in pictures_of(records, body)), *in_full(records)]
+        sections = sections_of(records, body)
     title = f"{records[0].environment}: {', '.join(record.name for record in records)}"
     path = place_of(out, folders)
     with naming_out(path):
@@ -59,76 +58,70 @@ def place_of(out: Path | None, folders: Sequence[Path]) -> Path:
     return out / ("report.html" if len(folders) == 1 else "comparison.html") if out.is_dir() else out
 
 
-def pictures_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[Picture]:
-    """All pictures, in the order in which they are read."""
+def sections_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[Section]:
+    """All sections, in the order in which they are read. A new section is a function and a line here."""
     return [
-        figures.best_returns(records),
-        diagnostics.learning_curves(records),
-        figures.designs_over_time(records, body),
-        figures.bodies(records, body),
-        figures.predictions(records),
-        diagnostics.model_errors(records),
-        diagnostics.losses(records),
-        diagnostics.times(records),
+        best_bodies(records[0]) if len(records) == 1 else comparison(records),
+        designs.best_returns(records),
+        learning.learning_curves(records),
+        designs.designs_over_time(records, body),
+        designs.bodies(records, body),
+        designs.predictions(records),
+        learning.model_errors(records),
+        learning.losses(records),
+        learning.times(records),
+        in_full("Settings", records, [record.settings for record in records]),
+        in_full("Versions and machine", records, [origin(record) for record in records]),
     ]
 
 
-def show(picture: Picture) -> str:
-    """The section of a picture, or of the sentence that says why there is none."""
-    if picture.figure is None:
-        return section(picture.title, note(picture.caption))
-    return section(picture.title, image(picture.figure, alt=picture.alt, caption=picture.caption), kind="picture")
+def best_bodies(record: Record) -> Section:
+    """The best body of each run."""
+    best = record.best
+    head = ["run", "best return", "design", "kind", *record.design_names]
+    rows = [
+        [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, xi)]
+        for (run, row), xi in zip(best.iterrows(), designs_of(best))
+    ]
+    if len(rows) > 1:
+        rows.append([f"mean of {len(rows)} runs", number(best["best_return"].mean()), *[""] * (len(head) - 2)])
+    return Section(title="Best bodies", notes=states([record]), tables=[*narrow(Table(head=head, rows=rows))])
 
 
-def in_short(records: Sequence[Record]) -> str:
-    """Where each folder stands, and its best returns: a table by folder, or of one folder by run."""
-    states = "".join(
-        note(f"{record.name}: {sentence}") for record in records for sentence in (state(record), *ill(record))
-    )
-    if len(records) == 1:
-        head = ["run", "best return", "design", "kind", *records[0].design_names]
-        best, diverged = records[0].best, records[0].diverged
-        rows = [
-            [f"run {run}", number(row["best_return"]), str(row["design"]), row["kind"], *map(number, xi)]
-            for (run, row), xi in zip(best.iterrows(), designs_of(best))
-        ]
-        if len(diverged):
-            head.append("diverged at")
-            places = diverged["diverged"].reindex(best.index, fill_value="-")
-            rows = [[*row, place] for row, place in zip(rows, places)]
-        if len(rows) > 1:
-            mean = best["best_return"].mean()
-            rows.append([f"mean of {len(rows)} runs", number(mean), *[""] * (len(head) - 2)])
-        return section("Best bodies", states + table(head, rows))
-    head = ["folder", "runs", "best return, mean", "standard deviation", "lowest", "highest", "designs", "episodes"]
-    head.append("diverged runs")
-    return section("Best returns", states + table(head, [compared(record) for record in records]))
+# Columns of the comparison: a name, and what stands there for a folder.
+COMPARED: dict[str, Callable[[Record], str]] = {
+    "folder": lambda record: record.name,
+    "runs": lambda record: str(record.num_runs),
+    "best return, mean": lambda record: number(record.best["best_return"].mean()),
+    "standard deviation": lambda record: number(record.best["best_return"].std()),
+    "lowest": lambda record: number(record.best["best_return"].min()),
+    "highest": lambda record: number(record.best["best_return"].max()),
+    "designs": lambda record: str(record.designs["design"].nunique()),
+    "episodes": lambda record: str(len(record.episodes[["design", "episode"]].drop_duplicates())),
+    "diverged runs": lambda record: str(len(record.diverged)),
+}
 
 
-def compared(record: Record) -> list[str]:
-    """A row of the comparison: statistics over the runs of a folder, of each run's best return."""
-    returns = record.best["best_return"]
-    statistics = (returns.mean(), returns.std(), returns.min(), returns.max())
-    counts = map(
-        str,
-        (
-            record.designs["design"].nunique(),
-            len(record.episodes[["design", "episode"]].drop_duplicates()),
-            len(record.diverged),
-        ),
-    )
-    return [record.name, str(record.num_runs), *map(number, statistics), *counts]
+def comparison(records: Sequence[Record]) -> Section:
+    """Statistics over the runs of each folder, of each run's best return."""
+    rows = [[column(record) for column in COMPARED.values()] for record in records]
+    return Section(title="Best returns", notes=states(records), tables=[*narrow(Table(head=[*COMPARED], rows=rows))])
+
+
+def states(records: Sequence[Record]) -> list[str]:
+    """How far each folder is, and what a reader must know of it."""
+    return [f"{record.name}: {sentence}" for record in records for sentence in (state(record), *ill(record))]
 
 
 def state(record: Record) -> str:
     """How far a run is, in a sentence."""
     last = record.episodes.iloc[-1]
-    learning = record.designs[~record.designs["run"].isin(record.diverged.index)]
+    others = record.designs[~record.designs["run"].isin(record.diverged.index)]
     planned = record.settings.get("num_designs", "?")
     begun = f"started {record.config.get('started', 'at an unknown time')}, {record.num_runs} run(s)"
-    if learning.empty:
+    if others.empty:
         return f"{begun}; every run has diverged, the last at {last['diverged']}, and it ended there."
-    if last["design"] == planned and learning["finished"].all():
+    if last["design"] == planned and others["finished"].all():
         return f"{begun}; all {planned} designs are done, after {last['seconds'] / 60:.3g} min."
     where = f"design {last['design']} of {planned}, episode {last['episode']}"
     return f"{begun}; at {where} after {last['seconds'] / 60:.3g} min: going on, or stopped there."
@@ -146,22 +139,24 @@ def ill(record: Record) -> list[str]:
     return [*found, f"{broken:.0f} simulation(s) broke and started again from rest."] if broken > 0 else found
 
 
-def in_full(records: Sequence[Record]) -> list[str]:
-    """The settings, the versions and the machine of each folder."""
-    several = len(records) > 1
-    origin = [
-        {"revision": r.config.get("revision"), "started": r.config.get("started")}
-        | dict(r.config.get("machine", {}))
-        | {f"products in {dtype}": library for dtype, library in r.config.get("products", {}).items()}
-        | dict(r.config.get("versions", {}))
-        for r in records
-    ]
-    found = []
-    for title, values in (("Settings", [r.settings for r in records]), ("Versions and machine", origin)):
-        names = list(dict.fromkeys(name for value in values for name in value))
-        rows = [[name, *(plain(value.get(name)) for value in values)] for name in names]
-        found.append(section(title, table(["", *(r.name for r in records)], rows, differing=several)))
-    return found
+def origin(record: Record) -> dict[str, Any]:
+    """The code and the machine of a run."""
+    config = record.config
+    return (
+        {"revision": config.get("revision"), "started": config.get("started")}
+        | dict(config.get("machine", {}))
+        | {f"products in {dtype}": library for dtype, library in config.get("products", {}).items()}
+        | dict(config.get("versions", {}))
+    )
+
+
+def in_full(title: str, records: Sequence[Record], values: Sequence[Mapping[str, Any]]) -> Section:
+    """Named values of each folder; those that are not the same in all folders are marked."""
+    names = list(dict.fromkeys(name for value in values for name in value))
+    rows = [[name, *(plain(value.get(name)) for value in values)] for name in names]
+    differing = frozenset(name for name, *cells in rows if len(set(cells)) > 1)
+    table = Table(head=["", *(record.name for record in records)], rows=rows, marked=differing)
+    return Section(title=title, tables=[*narrow(table)])
 
 
 def plain(value: Any) -> str:

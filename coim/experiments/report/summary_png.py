@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from coim.envs import MorphEnv
 from coim.experiments.drawing.bodies import draw_bodies
-from coim.experiments.report.curves import cross_handles, explain, plot_over_designs
+from coim.experiments.report.axes import cross_handles, explain, plot_over_designs
 from coim.experiments.run.atomic_write import written_aside
 from coim.experiments.run.records import read_record
 

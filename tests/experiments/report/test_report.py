@@ -39,6 +39,8 @@ class Page(HTMLParser):
         self.images: list[dict[str, str]] = []
         self.links: list[str] = []
         self.headings: list[str] = []
+        self.captions: list[str] = []
+        self.cells: list[int] = []  # of each row of a table
         self.words = ""
         self.feed(path.read_text(encoding="utf-8"))
         self.close()
@@ -49,6 +51,10 @@ class Page(HTMLParser):
         self.links += [found[name] for name in ("src", "href") if name in found]
         if tag == "img":
             self.images.append(found)
+        if tag == "tr":
+            self.cells.append(0)
+        if tag in ("th", "td"):
+            self.cells[-1] += 1
         if tag not in VOID:
             self.open.append(tag)
 
@@ -60,12 +66,17 @@ class Page(HTMLParser):
             self.words += data
             if "h2" in self.open:
                 self.headings.append(data)
+            if "figcaption" in self.open:
+                self.captions.append(data)
 
 
 def check(path: Path) -> Page:
-    """A page is well formed, fetches nothing, and shows no number that is none."""
+    """A page is well formed, fetches nothing, shows no NaN, and has short captions and narrow tables."""
     page = Page(path)
     assert page.images
+    assert len(page.captions) == len(page.images)
+    assert all(0 < len(caption.split()) <= 60 for caption in page.captions)
+    assert max(page.cells) <= 10
     assert all(link.startswith("data:image/svg+xml;base64,") for link in page.links)
     assert not re.search(r"\bnan\b", page.words, re.IGNORECASE)
     for image in page.images:
@@ -207,6 +218,20 @@ def test_folders_become_a_comparison(runs: Path, tmp_path: Path, capsys: pytest.
     assert '<tr><th scope="row">task</th>' in out.read_text()
 
 
+def test_a_comparison_of_many_folders_has_several_tables_and_marks_differences_between_all(
+    runs: Path, tmp_path: Path
+) -> None:
+    folders = [shutil.copytree(runs / "one", tmp_path / f"copy{i}") for i in range(11)]
+    config = json.loads((folders[-1] / "config.json").read_text())
+    config["settings"]["gamma"] = 0.5  # the only one, and in the second table
+    (folders[-1] / "config.json").write_text(json.dumps(config))
+    out = write_report(folders, out=tmp_path / "all.html")
+    page = check(out)
+    assert page.words.count("Versions and machine") == 1
+    assert out.read_text().count('<tr class="differs"><th scope="row">gamma</th>') == 2
+    assert all(f"copy{i}" in page.words for i in range(11))
+
+
 def test_folders_of_one_name_are_told_apart_by_their_paths(runs: Path, tmp_path: Path) -> None:
     shutil.copytree(runs / "one", tmp_path / "one")
     assert [record.name for record in read_records([runs / "one", tmp_path / "one"])] == [
@@ -336,7 +361,7 @@ def test_the_rank_correlation_is_told_of_each_run() -> None:
 
 
 def test_long_runs_are_drawn_as_means_of_neighbouring_episodes(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coim.experiments.report.curves.MOST_EPISODES", 3)
+    monkeypatch.setattr("coim.experiments.report.axes.MOST_EPISODES", 3)
     assert "A point is the mean of 3 episodes." in check(write_report([runs / "one"], out=runs / "long.html")).words
 
 

@@ -1,35 +1,33 @@
-"""Curves over designs and over training: what the pictures of a run and of a comparison are made of."""
+"""Lines, marks and legends that the figures of a report share: a line for each run folder, a mark for each design."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from coim.experiments.drawing.curves import draw_mean, draw_runs
 from coim.experiments.drawing.palette import BLACK, GREY, KINDS, LIGHT, kind_handles, literal, put_legend, style_of
 from coim.experiments.frames import Curves, curves
 from coim.experiments.run.records import Record
 
-STEPS = "training steps of one run"
 MANY_MARKS = 120
 MOST_EPISODES = 500  # points of a curve; of more, neighbours are averaged
-MANY_POINTS = 2000  # faint lines of more points than that are pixels, so that the page stays small
 
 
-def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = True, **style: str) -> None:
-    """Each run a faint line, their mean a strong one."""
+def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = True, **style: Any) -> None:
+    """Each run a faint line where there are several, their mean a strong one."""
     if not found.x.size:
         return
     if faint and len(found.y) > 1:
-        faintness = {"linewidth": 0.6, "alpha": max(0.15, min(0.4, 1.5 / len(found.y))), "zorder": 1}
-        for run in found.y:
-            axes.plot(found.x, run, color=style["color"], rasterized=found.y.size > MANY_POINTS, **faintness)
-    marker = "o" if found.x.size == 1 else ""  # a line through one point would not be seen
-    axes.plot(found.x, found.mean, linewidth=1.4, zorder=3, label=label, marker=marker, **style)
+        draw_runs(axes, found.x, found.y, color=style["color"])
+    draw_mean(axes, found.x, found.mean, label=label, **style)
 
 
 def episodes_in_a_point(record: Record) -> int:
@@ -37,14 +35,14 @@ def episodes_in_a_point(record: Record) -> int:
     return max(1, math.ceil(record.episodes["env_steps"].nunique() / MOST_EPISODES))
 
 
-def points_in_words(records: Sequence[Record]) -> str:
-    """A sentence on what a point is the mean of, where it is one of several episodes."""
+def points_in_words(records: Sequence[Record]) -> list[str]:
+    """A note on what a point is the mean of, where it is the mean of several episodes."""
     most = max(episodes_in_a_point(record) for record in records)
-    return f" A point is the mean of {'up to ' if len(records) > 1 else ''}{most} episodes." if most > 1 else ""
+    return [f"A point is the mean of {'up to ' if len(records) > 1 else ''}{most} episodes."] if most > 1 else []
 
 
 def plot_over_steps(
-    axes: Axes, records: Sequence[Record], column: str, *, prefix: str = "", faint: bool = True, **style: str
+    axes: Axes, records: Sequence[Record], column: str, *, prefix: str = "", faint: bool = True, **style: Any
 ) -> bool:
     """One column of the episodes of each folder over training steps; says whether there was a number at all."""
     drawn = False
@@ -74,7 +72,7 @@ def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> Non
         rows = rows.assign(**{column: means, "finished": finished})
         mark_kinds(axes, rows, column, style["color"] if len(records) > 1 else None)
         mark_divergences(axes, record.designs[record.designs["diverged"] != ""], "design", column)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.locator_params(axis="x", integer=True)
 
 
 def mark_kinds(axes: Axes, rows: pd.DataFrame, column: str, colour: str | None = None, x: str = "design") -> None:
@@ -113,18 +111,18 @@ def explain(
     *,
     kinds: bool = False,
     mean: bool = True,
-    more: Sequence[Line2D] = (),
+    more: Sequence[Artist] = (),
 ) -> None:
     """A legend above the figure: folders where there are several, kinds of design where they are marked, the mean."""
     several = len(records) > 1
-    handles = [
+    handles: list[Artist] = [
         Line2D([], [], label=literal(r.name), **style_of(i, len(records))) for i, r in enumerate(records) if several
     ]
     if kinds:
         there = [kind for record in records for kind in record.designs["kind"]]
         handles += kind_handles(there, GREY if several else None)
         if any(_under_way(record) for record in records):
-            hollow = {"markerfacecolor": "white", "markeredgecolor": GREY}
+            hollow: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": GREY}
             handles.append(Line2D([], [], marker="o", linestyle="", label="not finished", **hollow))
     if mean and not several and records[0].num_runs > 1:
         handles.append(Line2D([], [], label=f"mean of {records[0].num_runs} runs", **style_of(0, 1)))
