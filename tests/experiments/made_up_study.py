@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from coim.experiments.figures.figure import Plot
+from coim.experiments.figures.plot import Plot
 from coim.experiments.study.ledger import Entry, State, in_csv
 from coim.experiments.study.runs import parts_of
 

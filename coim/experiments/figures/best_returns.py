@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 
 from coim.experiments.drawing.curves import draw_mean
 from coim.experiments.drawing.palette import GREY, put_legend
-from coim.experiments.figures.figure import Plot, missing
 from coim.experiments.figures.legend import line_entries
+from coim.experiments.figures.plot import Plot, missing
 from coim.experiments.statistics.intervals import RESAMPLES, Statistic, iqm, mean, over_runs
 from coim.experiments.study.arms import ARMS, FAMILIES, arm_named, in_order
 from coim.experiments.study.runs import Place, Run, Runs, read_runs

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import CIRCLE
-from coim.experiments.figures.figure import Plot
+from coim.experiments.figures.plot import Plot
 
 GRAVITY = 9.8  # m/s^2
 CART_MASS = 1.0  # kg

@@ -11,9 +11,8 @@ from pathlib import Path
 import matplotlib as mpl
 
 from coim.experiments.drawing.layout import FONT
-from coim.experiments.figures import best_returns as returns
-from coim.experiments.figures import cartpole, design_space, model_error, retrained, statistics
-from coim.experiments.figures.figure import Plot
+from coim.experiments.figures import best_returns, cartpole, comparisons, design_plane, error_curves, from_scratch
+from coim.experiments.figures.plot import Plot
 from coim.experiments.model_error.tables import FOLDER
 from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, written_aside
 from coim.experiments.run.progress import counted
@@ -23,8 +22,8 @@ from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import read_runs
 from coim.run_folder import read_config
 
-MODULES = (returns, retrained, model_error, design_space, cartpole, statistics)
-OF_MODELS = (model_error, design_space, cartpole)  # what a folder without cells has, Fig. 4
+MODULES = (best_returns, from_scratch, error_curves, design_plane, cartpole, comparisons)
+OF_MODELS = (error_curves, design_plane, cartpole)  # what a folder without cells has, Fig. 4
 SUFFIXES = ("png", "pdf", "csv", "md")
 TITLE = "# Figures of "
 RESOLUTION = 150  # dots per inch of a PNG

@@ -11,9 +11,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import imread
 
 from coim.experiments.commands.figures import main
-from coim.experiments.figures import best_returns as returns
-from coim.experiments.figures import statistics, write
-from coim.experiments.figures.figure import Plot
+from coim.experiments.figures import best_returns, comparisons, write
+from coim.experiments.figures.plot import Plot
 from coim.experiments.figures.write import write_figures
 from coim.experiments.study.arms import ARMS
 from tests.experiments.made_up_study import check_words, read_table, write_cell, write_ledger, write_table
@@ -37,7 +36,7 @@ def study(tmp_path: Path) -> Path:
 def test_figures_of_a_study_that_is_not_ours_go_where_out_says_and_over_nothing_of_others(
     study: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coim.experiments.figures.write.MODULES", (statistics,))
+    monkeypatch.setattr("coim.experiments.figures.write.MODULES", (comparisons,))
     out = tmp_path_factory.mktemp("mine")
     (out / "README.md").write_text("# Mine")
     with pytest.raises(SystemExit, match=r"README.md is no page of figures .* with --out"):
@@ -199,7 +198,7 @@ def test_a_panel_without_a_run_says_so_and_the_one_above_has_the_numbers(study: 
 
 
 def drawn(study: Path) -> dict[str, Plot]:
-    return {plot.name: plot for module in (returns, statistics) for plot in module.plots(study)}
+    return {plot.name: plot for module in (best_returns, comparisons) for plot in module.plots(study)}
 
 
 def test_a_study_that_has_just_begun_says_what_is_missing_and_keeps_no_old_figure(tmp_path: Path) -> None:

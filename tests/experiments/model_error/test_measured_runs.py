@@ -10,8 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from coim.experiments.figures import design_space, model_error
-from coim.experiments.figures.figure import Plot
+from coim.experiments.figures import design_plane, error_curves
+from coim.experiments.figures.plot import Plot
 from coim.experiments.model_error.tables import CHANGES, ERRORS, errors, late_share
 from tests.experiments.made_up_study import check_words, write_table
 
@@ -54,7 +54,7 @@ def series(plot: Plot, name: str) -> list[dict]:
 def test_folders_and_runs_of_a_fleet_are_runs_of_one_figure_with_an_interval(tmp_path: Path) -> None:
     write_measured(tmp_path, "hopper-0", [2, 1, 1, 1], seed=0)
     write_measured(tmp_path, "hopper-1", [1, 1, 1, 0.5], [6, 4, 1, 0.3], seed=1, still=4.0)
-    (plot,) = model_error.plots(tmp_path)
+    (plot,) = error_curves.plots(tmp_path)
     assert plot.name == "figure_4a_model_error_hopper"
     assert lines_of(plot, 0, "_seen") == [
         [[10, 1], [20, 0.5], [30, 0.5], [40, 0.5]],
@@ -82,7 +82,7 @@ def test_folders_and_runs_of_a_fleet_are_runs_of_one_figure_with_an_interval(tmp
 
 def test_a_lone_run_has_neither_a_mean_nor_an_interval(tmp_path: Path) -> None:
     write_measured(tmp_path, "", [2, 1, 1, 1])
-    (plot,) = model_error.plots(tmp_path)
+    (plot,) = error_curves.plots(tmp_path)
     assert lines_of(plot, 0, "_seen") == series(plot, "mean") == []
     assert "interval" not in plot.caption
 
@@ -91,19 +91,19 @@ def test_tasks_environments_and_ways_to_imagine_have_figures_of_their_own(tmp_pa
     write_measured(tmp_path, "a", [2.0], task="forward", imagine="known")
     write_measured(tmp_path, "b", [4.0], task="backward", imagine="known")
     write_measured(tmp_path, "c", [6.0], task="backward", imagine="known", environment="walker")
-    drawn = {plot.name: lines_of(plot, 0, "seen")[0][0][1] for plot in model_error.plots(tmp_path)}
+    drawn = {plot.name: lines_of(plot, 0, "seen")[0][0][1] for plot in error_curves.plots(tmp_path)}
     stem = "figure_4a_model_error"
     expected = {f"{stem}_hopper_backward": 2.0, f"{stem}_hopper_forward": 1.0, f"{stem}_walker_backward": 3.0}
     assert drawn == expected
     write_measured(tmp_path, "d", [8.0], task="forward", imagine="noisy")
-    names = [plot.name for plot in model_error.plots(tmp_path)]
+    names = [plot.name for plot in error_curves.plots(tmp_path)]
     assert names[1:3] == [f"{stem}_hopper_forward_known", f"{stem}_hopper_forward_noisy"]
 
 
 def test_a_mean_is_of_steps_at_which_all_runs_that_had_got_so_far_were_measured(tmp_path: Path) -> None:
     write_measured(tmp_path, "often", [2.0, 4.0, 4.0, 8.0, 8.0], steps=(5, 10, 15, 20, 30))
     write_measured(tmp_path, "seldom", [6.0, 4.0], steps=(10, 20))  # and ends, or is under way
-    (plot,) = model_error.plots(tmp_path)
+    (plot,) = error_curves.plots(tmp_path)
     assert lines_of(plot, 0, "seen") == [[[10, 2.5], [20, 3], [30, 4]]]
     assert [len(line) for line in lines_of(plot, 0, "_seen")] == [5, 2]
     assert [row["runs"] for row in series(plot, "mean")] == [2, 2, 1]
@@ -113,7 +113,7 @@ def test_a_mean_is_of_steps_at_which_all_runs_that_had_got_so_far_were_measured(
 def test_runs_that_differ_in_more_than_their_seed_are_told(tmp_path: Path) -> None:
     write_measured(tmp_path, "a", [2.0], seed=0, batch_size=256, out="a")
     write_measured(tmp_path, "b", [4.0], seed=1, batch_size=128, out="b")
-    (plot,) = model_error.plots(tmp_path)
+    (plot,) = error_curves.plots(tmp_path)
     assert "The runs differ in more than their seed: batch_size." in plot.notes
 
 
@@ -146,7 +146,7 @@ def write_planes(folder: Path, change: float) -> None:
 def test_of_several_folders_the_first_is_looked_into_and_the_others_are_named(tmp_path: Path) -> None:
     for name, change, task in (("a", 1, "forward"), ("b", 2, "backward"), ("c", 3, "forward")):
         write_planes(write_measured(tmp_path, name, [1.0], task=task), change)
-    plots = {plot.name: plot for plot in design_space.plots(tmp_path)}
+    plots = {plot.name: plot for plot in design_plane.plots(tmp_path)}
     assert [*plots] == ["figure_4b_design_space_hopper_backward", "figure_4b_design_space_hopper_forward"]
     backward, forward = plots.values()
     assert [float(str(plot.rows[0]["normalised/next"])) for plot in (backward, forward)] == [2, 1]

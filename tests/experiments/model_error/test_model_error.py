@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from coim import HopperMorph, Policy
 from coim.experiments.commands.model_error import main
-from coim.experiments.figures import design_space, model_error
+from coim.experiments.figures import design_plane, error_curves
 from coim.experiments.frames import read_frame
 from coim.experiments.model_error.run import probe, write_design_space
 from coim.experiments.model_error.tables import CHANGES, ERRORS
@@ -209,7 +209,7 @@ def test_too_few_designs_for_two_components_are_told(tmp_path: Path, capsys: pyt
         patched.setattr("test_model_error.OPTIONS", options)
         measure(tmp_path / "one", "--num-designs", "1")
     assert "no design_space.csv: designs on one line, 1 in all" in capsys.readouterr().out
-    assert [plot.figure for plot in design_space.plots(tmp_path)] == [None]
+    assert [plot.figure for plot in design_plane.plots(tmp_path)] == [None]
 
 
 def test_a_run_that_ended_before_anything_was_measured_says_so(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_run_that_ended_before_anything_was_measured_says_so(tmp_path: Path) -
 
 
 def test_the_figures_show_what_was_measured(study: Path) -> None:
-    (errors,), (space,) = model_error.plots(study), design_space.plots(study)
+    (errors,), (space,) = error_curves.plots(study), design_plane.plots(study)
     assert (errors.name, space.name) == ("figure_4a_model_error_hopper", "figure_4b_design_space_hopper")
     measured = read(study / "model_error" / "model_error.csv")
     written = read_frame(study / "model_error" / ERRORS.file, ERRORS)
@@ -248,7 +248,7 @@ def is_of(row: dict[str, str], probe_name: str, predict: str) -> bool:
 
 
 def test_each_panel_of_the_design_space_has_the_colours_of_its_state_and_source_where_they_belong(study: Path) -> None:
-    (space,) = design_space.plots(study)
+    (space,) = design_plane.plots(study)
     rows = read(study / "model_error" / "design_space.csv")
     written = read_frame(study / "model_error" / CHANGES.file, CHANGES)
     pd.testing.assert_frame_equal(pd.DataFrame(space.rows).astype(written.dtypes), written)
@@ -275,13 +275,13 @@ def test_a_measured_run_without_a_measurement_yet_is_told_not_drawn(study: Path,
     folder.mkdir()
     (folder / "config.json").write_text((study / "model_error" / "config.json").read_text())
     (folder / ERRORS.file).write_text(",".join(ERRORS.header()) + "\n")
-    (plot,) = model_error.plots(tmp_path)
+    (plot,) = error_curves.plots(tmp_path)
     assert plot.figure is None
     assert f"There is no measurement yet in {folder / ERRORS.file}" in plot.caption
 
 
 def test_without_its_input_a_figure_says_what_to_run(tmp_path: Path) -> None:
-    for module in (model_error, design_space):
+    for module in (error_curves, design_plane):
         (plot,) = module.plots(tmp_path)
         assert plot.figure is None
         assert f"coim model-error ENVIRONMENT --out {tmp_path / 'model_error'}" in plot.caption

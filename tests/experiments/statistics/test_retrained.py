@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from coim.experiments.figures import retrained
-from coim.experiments.figures.figure import Plot
+from coim.experiments.figures import from_scratch
+from coim.experiments.figures.plot import Plot
 from coim.experiments.figures.write import write_figures
 from coim.experiments.statistics import retrained as retrained_pairs
 from coim.experiments.statistics.measures import welch
@@ -51,7 +51,7 @@ def of_seeds(*returns: float) -> list[tuple[int, str, float]]:
 
 
 def drawn(study: Path) -> tuple[Plot, Plot]:
-    designs, tests = retrained.plots(study)
+    designs, tests = from_scratch.plots(study)
     return designs, tests
 
 

@@ -21,7 +21,7 @@ from matplotlib.patheffects import withStroke
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import CIRCLE, put_legend
-from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.figures.plot import Plot, missing
 from coim.experiments.frames import read_frame, rows_of
 from coim.experiments.model_error.tables import CHANGES, FOLDER, Kind, folders_with, name_of
 from coim.pairs import IN_THE_FLOOR

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import GREY
-from coim.experiments.figures.figure import Cells, Plot, missing, shown
+from coim.experiments.figures.plot import Cells, Plot, missing, shown
 from coim.experiments.frames import at, read_frame, rows_of
 from coim.experiments.statistics.intervals import RESAMPLES
 from coim.experiments.statistics.retrained import by_place, pairs, results, sizes

@@ -20,7 +20,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from coim.experiments.drawing.curves import draw_mean, draw_runs
 from coim.experiments.drawing.layout import STEPS, new_figure
 from coim.experiments.drawing.palette import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, put_legend
-from coim.experiments.figures.figure import Plot, missing
+from coim.experiments.figures.plot import Plot, missing
 from coim.experiments.frames import read_frame, rows_of
 from coim.experiments.model_error.tables import (
     ERRORS,

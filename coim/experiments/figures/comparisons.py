@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 
 from coim.experiments.drawing.layout import new_figure
 from coim.experiments.drawing.palette import BLACK, GREY, put_legend
-from coim.experiments.figures.figure import Plot, missing, shown
 from coim.experiments.figures.legend import point_entries
+from coim.experiments.figures.plot import Plot, missing, shown
 from coim.experiments.frames import at, rows_of
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, interval, iqm, mean
 from coim.experiments.statistics.measures import MEASURES, NUMBERS, Cells, comparisons, limits, measures, predictions
