@@ -24,8 +24,8 @@ def draw_bodies(axes: Axes, rows: pd.DataFrame, body: type[MorphEnv]) -> None:
     """Draw designs from left to right on one floor, each above its number and its best return.
 
     Args:
-        axes: to draw on.
-        rows: of `coim.experiments.run.records.Record.designs`, at least one.
+        axes: axes to draw on.
+        rows: rows of `coim.experiments.run.records.Record.designs`, at least one.
         body: the environment that the designs belong to.
     """
     env = body(num_runs=len(rows), reset_noise=0, seed=0)
@@ -53,7 +53,7 @@ def draw_lines_of_bodies(lines: Sequence[tuple[str, pd.DataFrame]], body: type[M
 
     Args:
         lines: a title (may be empty) and the designs of each line.
-        body: what the designs belong to.
+        body: environment that the designs belong to.
     """
     figure = Figure(layout="constrained")
     grid = figure.subplots(len(lines), 1, squeeze=False)[:, 0]

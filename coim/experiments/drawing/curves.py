@@ -17,10 +17,10 @@ def draw_runs(axes: Axes, x: np.ndarray, runs: np.ndarray, *, color: str, **styl
     """A faint line for each run, through the points at which it has a number.
 
     Args:
-        axes: to draw on.
+        axes: axes to draw on.
         x: the points, ``[X]``.
         runs: their values, ``[R, X]``, NaN where a run has none.
-        color: of the lines.
+        color: color of the lines.
         style: more keywords of matplotlib.
     """
     alpha = max(0.15, min(0.4, 1.5 / max(1, len(runs))))
@@ -37,13 +37,13 @@ def draw_mean(
     """A strong line, and around it a band; bars in its place where the line is only marks.
 
     Args:
-        axes: to draw on.
+        axes: axes to draw on.
         x: the points, ``[X]``.
         value: mean or another statistic over runs, ``[X]``.
         low: lower end of its interval, ``[X]``; None for no band.
         high: upper end, ``[X]``.
-        color: of line and band.
-        linestyle: of line and band; "none" for marks.
+        color: color of line and band.
+        linestyle: style of line and band; "none" for marks.
         marker: at each point; a lone point has one anyway, as a line through it would not be seen.
         style: more keywords of matplotlib for the line.
     """

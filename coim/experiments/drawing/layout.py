@@ -17,7 +17,7 @@ def new_figure(height: float, rows: int = 1, columns: int = 1, *, sharex: bool =
     """A figure of the page's width, and its axes without a frame at the top and right, line by line.
 
     Args:
-        height: in inches.
+        height: height of the figure in inches.
         rows: lines of axes.
         columns: axes in a line.
         sharex: whether all axes have the same x.

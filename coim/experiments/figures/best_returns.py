@@ -47,7 +47,7 @@ def plots(study: Path) -> Iterator[Plot]:
 
 
 def families(there: Sequence[str]) -> dict[str, list[str]]:
-    """Arms of each figure beside the paper's: a family whose arms the paper does not have all, with its baselines."""
+    """Figures beside the paper's: each family with an arm that the paper does not draw, with the family's baselines."""
     figures = {}
     for family in FAMILIES:
         own = [name for name in there if ARMS[name].family == family]
@@ -87,7 +87,7 @@ def draw(name: str, runs: Runs, arms: list[str]) -> Plot:
 
 
 def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:
-    """Lines of panels: environments side by side, mean above IQM; of one environment alone these two side by side."""
+    """Lines of panels: environments side by side, mean above IQM; for a single environment mean beside IQM."""
     environments, tasks = (list(dict.fromkeys(part)) for part in zip(*places))
     if len(environments) == 1:
         return [[((environments[0], task), label) for label in STATISTICS] for task in tasks]
@@ -97,7 +97,7 @@ def arranged(places: Sequence[Place]) -> list[list[tuple[Place, str]]]:
 def draw_panel(
     axes: Axes, runs: Runs, place: Place, arms: list[str], label: str, rows: list[dict[str, object]]
 ) -> bool:
-    """Runs and one statistic of every arm; adds what it drew to the rows, and says whether there was anything."""
+    """Draw runs and one statistic of every arm, and add the numbers to ``rows``; returns whether there were any."""
     environment, task = place
     failure = runs.failure(place)
     for arm in arms:

@@ -123,7 +123,7 @@ def draw_arms(axes: Axes, runs: Runs, place: Place, name: str, measured: pd.Data
 
 
 def name_arms(axes: Axes, arms: Sequence[str]) -> None:
-    """Names below the columns: side by side, slanted or upright, as there is room for them."""
+    """Write names below the columns: side by side, slanted or upright, by their number."""
     turned: dict[str, Any] = {}
     if angle := angle_of_names(arms):
         turned = {"rotation": angle, "ha": "right", "rotation_mode": "anchor"}
@@ -133,12 +133,12 @@ def name_arms(axes: Axes, arms: Sequence[str]) -> None:
 
 
 def angle_of_names(arms: Sequence[str]) -> int:
-    """Degrees by which the names of so many arms are turned."""
+    """Degrees by which the names of these arms are turned."""
     return 0 if len(arms) <= 4 else 30 if len(arms) <= 7 else 90
 
 
 def room_for_names(arms: Sequence[str]) -> float:
-    """Inches that turned names take from the height of a panel; none where they stand side by side."""
+    """Inches that turned names take from the height of a panel; 0 for names side by side."""
     longest = max(map(len, arms), default=0) * 0.07  # inches of a letter
     return longest * math.sin(math.radians(angle_of_names(arms)))
 

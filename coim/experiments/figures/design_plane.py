@@ -32,7 +32,7 @@ SHOWN = (1e-3, 1e2)  # variances of one-step changes; beyond, colours end
 
 
 def plots(study: Path) -> Iterator[Plot]:
-    """A row of panels for each state: two models and the simulator; of each kind of run its first folder by name."""
+    """A row of panels for each state: two models and the simulator, from the first folder of each kind of run."""
     found = folders_with(study, CHANGES.file)
     if not found:
         line = f"coim model-error ENVIRONMENT --out {study / FOLDER}"

@@ -30,7 +30,7 @@ RESOLUTION = 150  # dots per inch of a PNG
 
 
 def write_figures(study: Path, out: Path | None = None) -> list[Plot]:
-    """Write every figure that has something to show.
+    """Write every figure that has data.
 
     Args:
         study: its folder.
@@ -135,7 +135,7 @@ def arms_in_words(names: Sequence[str]) -> list[str]:
 
 
 def made_by(study: Path) -> str:
-    """The code that made the runs; runs of several revisions may be runs of several algorithms.
+    """A sentence on the revision of the code that made the runs, or on all of them if there are several.
 
     Example:
         >>> made_by(Path("docs/results/preview"))  # doctest: +SKIP
@@ -163,7 +163,7 @@ def table(rows: Sequence[Mapping[str, object]]) -> str:
 
 
 def cell(value: object, *, digits: int) -> object:
-    """A number to so many significant digits; an empty cell for one that is not known."""
+    """A number with that many significant digits; an empty cell for an unknown one."""
     if isinstance(value, float):
         return ("" if digits > 3 else "-") if math.isnan(value) else number(value, digits)
     return value

@@ -1,4 +1,4 @@
-"""Lines, marks and legends that the figures of a report share: a line for each run folder, a mark for each design."""
+"""Lines, marks and legends that the figures of a report share."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def plot_curves(axes: Axes, found: Curves, *, label: str = "", faint: bool = Tru
 
 
 def episodes_in_a_point(record: Record) -> int:
-    """Episodes that a point of a curve over training steps is the mean of."""
+    """Number of episodes that are averaged into one point of a curve over training steps."""
     return max(1, math.ceil(record.episodes["env_steps"].nunique() / MOST_EPISODES))
 
 
 def points_in_words(records: Sequence[Record]) -> list[str]:
-    """A note on what a point is the mean of, where it is the mean of several episodes."""
+    """A note on how many episodes a point averages, if more than one."""
     most = max(episodes_in_a_point(record) for record in records)
     return [f"A point is the mean of {'up to ' if len(records) > 1 else ''}{most} episodes."] if most > 1 else []
 
@@ -44,7 +44,7 @@ def points_in_words(records: Sequence[Record]) -> list[str]:
 def plot_over_steps(
     axes: Axes, records: Sequence[Record], column: str, *, prefix: str = "", faint: bool = True, **style: Any
 ) -> bool:
-    """One column of the episodes of each folder over training steps; says whether there was a number at all."""
+    """Draw one column of the episodes of each folder over training steps; returns whether it has any number."""
     drawn = False
     for index, record in enumerate(records):
         found = curves(record.episodes, "env_steps", column).averaged(episodes_in_a_point(record))
@@ -76,7 +76,7 @@ def plot_over_designs(axes: Axes, records: Sequence[Record], column: str) -> Non
 
 
 def mark_kinds(axes: Axes, rows: pd.DataFrame, column: str, colour: str | None = None, x: str = "design") -> None:
-    """A mark at each design by its kind; ``colour`` overrules the kind's own."""
+    """A mark at each design for its kind, in ``colour`` or in the kind's own colour."""
     for kind, (own, marker) in KINDS.items():
         for finished in (True, False):
             points = rows[(rows["kind"] == kind) & (rows["finished"] == finished)]
@@ -130,6 +130,6 @@ def explain(
 
 
 def mark_builds(axes: Axes, record: Record) -> None:
-    """A light line wherever the next body was built."""
+    """A light line at each step at which the next body was built."""
     for steps in record.episodes.groupby("design")["env_steps"].first().iloc[1:]:
         axes.axvline(steps, color=LIGHT, linewidth=0.6, zorder=0)

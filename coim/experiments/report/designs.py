@@ -1,4 +1,4 @@
-"""Pictures of the designs of a run, or of several that are compared: one function each."""
+"""Sections of the page on the designs of a run, or of several runs that are compared: one function each."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def predictions(records: Sequence[Record]) -> Section:
 
 
 def describe_correlation(rows: pd.DataFrame) -> str:
-    """Spearman's rank correlation of prediction and best return in words: of one run, or the mean over runs."""
+    """A sentence on Spearman's rank correlation of prediction and best return, as a mean over runs."""
     by_run = [own for _, own in rows.groupby("run")]
     values = [value for own in by_run if math.isfinite(value := spearman(own["predicted"], own["best_return"]))]
     if not values:

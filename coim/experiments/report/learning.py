@@ -1,4 +1,4 @@
-"""Pictures of the learning of a run, or of several that are compared: one function each."""
+"""Sections of the page on the learning of a run, or of several runs that are compared: one function each."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def learning_curves(records: Sequence[Record]) -> Section:
 
 
 def model_errors(records: Sequence[Record]) -> Section:
-    """How well the ensemble foresaw each new episode, and what it was asked about."""
+    """How well the ensemble predicted each new episode, and which share of imagined pairs is impossible."""
     title = "Model error over time"
     figure, (axes, below) = new_figure(4.6, 2, 1, sharex=True)
     if len(records) == 1:
@@ -138,7 +138,7 @@ def losses(records: Sequence[Record]) -> Section:
 
 
 def times(records: Sequence[Record]) -> Section:
-    """Where the wall-clock went."""
+    """Wall-clock of each activity."""
     title = "Time spent"
     spent = [seconds_of_activities(record) for record in records]
     activities = sorted(

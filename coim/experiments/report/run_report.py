@@ -22,11 +22,11 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
     """Write one self-contained page.
 
     Args:
-        folders: of the runs, at least one.
-        out: the page, or a folder for it; by default ``report.html`` in the run's folder. That is the page of one run:
-            a comparison is called otherwise, ``runs/comparison-DATE.html`` by default.
-        body: what the designs belong to; by default what the environment's name says, and if no such environment is
-            known the bodies are not drawn.
+        folders: run folders, at least one.
+        out: the page, or a folder for it. The default is ``report.html`` in the run folder for one run, and
+            ``runs/comparison-DATE.html`` for several.
+        body: environment that the designs belong to. The default is the environment of the run's name; if coim has no
+            such environment, the bodies are not drawn.
 
     Returns:
         The page.
@@ -50,7 +50,7 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
 
 
 def place_of(out: Path | None, folders: Sequence[Path]) -> Path:
-    """Where a page goes, as `write_report` says."""
+    """Path of the page; see ``out`` of `write_report`."""
     if len(folders) == 1:
         out = out or folders[0]
     elif out is None:
@@ -59,7 +59,7 @@ def place_of(out: Path | None, folders: Sequence[Path]) -> Path:
 
 
 def sections_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[Section]:
-    """All sections, in the order in which they are read. A new section is a function and a line here."""
+    """All sections in the order of the page. A new section is a function and a line here."""
     return [
         best_bodies(records[0]) if len(records) == 1 else comparison(records),
         designs.best_returns(records),
@@ -88,7 +88,7 @@ def best_bodies(record: Record) -> Section:
     return Section(title="Best bodies", notes=states([record]), tables=[*narrow(Table(head=head, rows=rows))])
 
 
-# Columns of the comparison: a name, and what stands there for a folder.
+# Columns of the comparison: the name of each, and its text for a run folder. A new column is a line here.
 COMPARED: dict[str, Callable[[Record], str]] = {
     "folder": lambda record: record.name,
     "runs": lambda record: str(record.num_runs),
@@ -109,12 +109,12 @@ def comparison(records: Sequence[Record]) -> Section:
 
 
 def states(records: Sequence[Record]) -> list[str]:
-    """How far each folder is, and what a reader must know of it."""
+    """Sentences on each folder: how far it is, which runs diverged, and how many simulations broke."""
     return [f"{record.name}: {sentence}" for record in records for sentence in (state(record), *ill(record))]
 
 
 def state(record: Record) -> str:
-    """How far a run is, in a sentence."""
+    """A sentence on how far a run is."""
     last = record.episodes.iloc[-1]
     others = record.designs[~record.designs["run"].isin(record.diverged.index)]
     planned = record.settings.get("num_designs", "?")
@@ -128,11 +128,11 @@ def state(record: Record) -> str:
 
 
 def ill(record: Record) -> list[str]:
-    """What a reader must know of runs that have diverged, and of simulations that broke."""
+    """Sentences on runs that have diverged and on simulations that broke."""
     found = [
-        f"run {run} diverged at {place}: its losses or weights were no finite numbers any more. It was "
+        f"run {run} diverged at {place}: its losses or weights were no longer finite numbers. It was "
         "frozen there and has no rows afterwards. Its best return is the best until then; curves over runs are means "
-        "of those that were left."
+        "over the other runs from there on."
         for run, place in record.diverged["diverged"].items()
     ]
     broken = record.episodes.get("broken", pd.Series(dtype=float)).sum()

@@ -17,11 +17,11 @@ BODIES_SHOWN = 8
 
 
 def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
-    """Draw what the folder holds.
+    """Draw the best returns and the best bodies of a run.
 
     Args:
-        folder: of the run.
-        body: what the designs belong to.
+        folder: a run folder.
+        body: environment that the designs belong to.
 
     Returns:
         ``figures/designs.png`` in the folder.

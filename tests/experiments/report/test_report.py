@@ -213,8 +213,8 @@ def test_folders_become_a_comparison(runs: Path, tmp_path: Path, capsys: pytest.
     best = read_record(runs / "fleet", "").designs.groupby("run")["best_return"].max().tolist()
     assert f"{sum(best) / 3:.4g}" in page.words
     assert f"{max(best):.4g}" in page.words
-    assert "designs (differs)" not in page.words  # the mark is the style's, for eyes
-    assert '<tr class="differs"><th scope="row">designs</th>' in out.read_text()
+    assert "imagine (differs)" not in page.words  # the mark is the style's, for eyes
+    assert '<tr class="differs"><th scope="row">imagine</th>' in out.read_text()
     assert '<tr><th scope="row">task</th>' in out.read_text()
 
 
