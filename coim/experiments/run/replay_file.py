@@ -67,7 +67,7 @@ class ReplayFile:
         size = self.path.stat().st_size if self.path.exists() else 0
         if size < description["bytes"]:
             return f"{self.path.name} has {size} of its {description['bytes']} bytes"
-        if hashlib.sha256(self._bytes(description)).hexdigest() != description["sha256"]:
+        if hashlib.sha256(self._bytes(description).data).hexdigest() != description["sha256"]:
             return f"the first {description['bytes']} bytes of {self.path.name} are not those that were written"
         return None
 
@@ -75,7 +75,7 @@ class ReplayFile:
         """Return the described rows and go on behind them; later ones are cut off."""
         self.num_rows, self._size, self._layout = (description[key] for key in ("rows", "bytes", "layout"))
         table = self._bytes(description)
-        self._digest = hashlib.sha256(table)
+        self._digest = hashlib.sha256(table.data)
         rows, start = {}, 0
         for key, dtype, shape in self._layout:
             stop = start + np.dtype(dtype).itemsize * int(np.prod(shape))

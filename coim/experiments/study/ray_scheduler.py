@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -52,7 +53,9 @@ class Conductor:
         terminal: where its user reads.
     """
 
-    def __init__(self, folder: Path, cells: list[Cell], ledger: Ledger, resources: Resources, terminal: TextIO) -> None:
+    def __init__(
+        self, folder: Path, cells: Sequence[Cell], ledger: Ledger, resources: Resources, terminal: TextIO
+    ) -> None:
         self.ledger, self.folder = ledger, folder.resolve()
         unfinished = set(ledger.in_state("waiting"))
         self.cells = [cell for cell in cells if cell.name in unfinished]
@@ -152,11 +155,11 @@ class Conductor:
 
 def settings_in(folder: Path, cell: Cell, resources: Resources) -> Settings:
     """Settings of a cell's run, with its folder and its share of this machine."""
-    device = {"device": "cuda"} if resources.gpus else {}
-    return dataclasses.replace(cell.settings, out=folder / CELLS / cell.name, threads=resources.cpus, **device)
+    device = "cuda" if resources.gpus else cell.settings.device
+    return dataclasses.replace(cell.settings, out=folder / CELLS / cell.name, threads=resources.cpus, device=device)
 
 
-def take_up(folder: Path, cells: list[Cell], resources: Resources) -> Ledger:
+def take_up(folder: Path, cells: Sequence[Cell], resources: Resources) -> Ledger:
     """The ledger of a study, in which what was finished waits again if it is gone or has more designs to try.
 
     Args:
