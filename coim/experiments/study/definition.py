@@ -134,7 +134,8 @@ class Study(Block):
     name: str
     """Name of the study, and of its folder if no other is given."""
     protocol: Protocol = "paper"
-    """paper: Sec. 6.1. preview: the same networks and updates with fewer designs and episodes. smoke: seconds."""
+    """paper: Sec. 6.1. preview: the same networks and updates with fewer designs and episodes. pilot: small networks,
+    20 bodies. smoke: seconds."""
     seeds_per_cell: Count = 1
     """Seeds trained together in one cell, for a GPU. The first of them seeds all."""
     blocks: Annotated[tuple[Block, ...], LISTS] = ()

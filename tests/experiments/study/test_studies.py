@@ -44,10 +44,10 @@ def test_every_combination_is_a_cell_and_one_seed_of_all_arms_comes_before_the_n
 
 def test_arms_of_a_seed_differ_in_nothing_but_the_arm() -> None:
     cells = study(arms=tuple(ARMS), seeds=(5,), overrides={"lr": 0.1}).cells()
-    assert len(cells) == 7
-    common = {"imagine": "none", "bodies": "search", "dream": "ensemble"}
+    assert len(cells) == len(ARMS)
+    common = {name: getattr(Settings(), name) for arm in ARMS.values() for name in arm.settings}
     assert len({dataclasses.replace(cell.settings, **common) for cell in cells}) == 1
-    assert len({cell.settings for cell in cells}) == 7
+    assert len({cell.settings for cell in cells}) == len(ARMS)
     assert {cell.settings.lr for cell in cells} == {0.1}
     assert {cell.settings.seed for cell in cells} == {5}
 
@@ -83,7 +83,7 @@ def test_seeds_can_share_a_cell_along_the_run_axis() -> None:
         ({"environments": ("ant",)}, "'ant' is no environment; there are half_cheetah, hopper, walker"),
         ({"arms": ("oracel",)}, "arm 'oracel' is none of none, known"),
         ({"tasks": ("up",)}, "tasks has 'up', each must be 'forward' or 'backward'"),
-        ({"protocol": "papre"}, "protocol is 'papre', it must be 'paper', 'preview' or 'smoke'"),
+        ({"protocol": "papre"}, "protocol is 'papre', it must be 'paper', 'preview', 'pilot' or 'smoke'"),
         ({"overrides": {"learning_rate": 1}}, "overrides of learning_rate are not possible"),
         ({"overrides": {"seed": 1}}, "overrides of seed are not possible"),
         ({"overrides": {"num_cells": 4}}, "num_cells is 4, it must be a list"),

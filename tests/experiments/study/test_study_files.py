@@ -55,7 +55,7 @@ WRONG: list[tuple[Any, str]] = [
     ({"seed": 1}, "there is no seed; similar names are seeds"),
     ({"name": "a"}, "it has no environments, arms, seeds; add what is missing"),
     (LEAST | {"name": 3}, "name is 3, it must be a string"),
-    (LEAST | {"protocol": ["smoke"]}, "protocol is ['smoke'], it must be 'paper', 'preview' or 'smoke'"),
+    (LEAST | {"protocol": ["smoke"]}, "protocol is ['smoke'], it must be 'paper', 'preview', 'pilot' or 'smoke'"),
     (LEAST | {"environments": "hopper"}, "environments is 'hopper', it must be a list"),
     (LEAST | {"environments": [["hopper"]]}, "environments has ['hopper'], each must be a string"),
     (LEAST | {"environments": []}, "environments is empty"),
