@@ -166,7 +166,7 @@ def filmed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, list[Take]]]:
 
 
 def test_a_run_without_its_policies_is_filmed_with_that_of_the_population(copied: Path, filmed: list) -> None:
-    with pytest.raises(SystemExit, match=r"keeps no policy of design 2; to film .* add --policy population"):
+    with pytest.raises(SystemExit, match=r"keeps no policy of design 2; add --policy population to film"):
         main([str(copied), "--design", "2", "--run", "1"])
     main([str(copied), "--design", "2", "--run", "1", "--policy", "population"])
     ((path, (shot,)),) = filmed
