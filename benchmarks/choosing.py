@@ -12,7 +12,7 @@ import csv
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from statistics import stdev
 from unittest import mock
@@ -25,6 +25,7 @@ from benchmarks.choosing_arms import ARMS, Arm
 from benchmarks.surfaces import Surface, hartmann, made_up_critic, pooled, stored, trained_critic, uniform
 from coim.designs import DesignPosterior, GradientSearch, TrustRegion
 from coim.designs.search import Fitness
+from coim.tables import Layout, read_table
 
 KEY = ("surface", "arm", "critic", "designs")  # columns that tell arms apart
 WITHIN_90 = 1.645  # deviations, of a normal distribution
@@ -205,6 +206,10 @@ def _interval(name: str, values: list[float]) -> dict[str, str]:
     return dict(zip((name, f"{name}_low", f"{name}_high"), (f"{number:.0f}" for number in numbers)))
 
 
+COLUMNS = [field.name for field in fields(Study)]
+LAYOUT = Layout(file="studies.csv", columns=dict.fromkeys(COLUMNS, str), needed=tuple(COLUMNS), grows=False)
+
+
 @dataclass(frozen=True)
 class Asked:
     """Simulate studies; what is in ``studies.csv`` already is not simulated again.
@@ -225,7 +230,9 @@ def main(asked: Asked) -> None:
     torch.set_num_threads(1)
     asked.out.mkdir(parents=True, exist_ok=True)
     file = asked.out / "studies.csv"
-    rows = list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
+    # As text: what was simulated before is written again as it stands.
+    table = read_table(file, LAYOUT)
+    rows = [dict(zip(table, map(str, cells))) for cells in zip(*table.values())]
     for arm in ARMS[: asked.arms or None]:
         key = (arm.surface, arm.name, str(arm.critic), str(arm.designs))
         seeds = {int(row["seed"]) for row in rows if tuple(row[name] for name in KEY) == key}

@@ -5,7 +5,6 @@ Shapes: ``P`` designs, ``D`` design entries, ``C`` coefficients.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +19,9 @@ from benchmarks.networks import load
 from benchmarks.value_states import CELLS, visited
 from coim import DesignValue, MorphEnv, Policy, QValue
 from coim.designs.search import Fitness
+from coim.experiments.frames import read_frame
+from coim.run_folder import DESIGNS
+from coim.tables import DESIGN_PREFIX
 
 NOISE = 440.0  # deviation of the best return of one body from run to run, in the preview study's Hoppers
 RIDGE = 3.0  # of the pooled surface's coefficients: 16 from 300 returns
@@ -80,11 +82,10 @@ def stored(environment: str, cells: Path = CELLS) -> list[Tried]:
     """Every body that the preview study tried in an environment, in the order of building within its run."""
     found = []
     for file in sorted(cells.glob(f"{environment}-*/designs.csv")):
-        with file.open(newline="") as table:
-            for row in csv.DictReader(table):
-                design = torch.tensor([float(value) for name, value in row.items() if name.startswith("xi_")])
-                number = int(row["design"])
-                found.append(Tried(file.parent.name, number, row["kind"], design, float(row["best_return"])))
+        table = read_frame(file, DESIGNS)
+        designs = torch.tensor(table.filter(like=DESIGN_PREFIX).to_numpy(), dtype=torch.float32)
+        told = zip(table["design"], table["kind"], designs, table["best_return"])
+        found += [Tried(file.parent.name, number, kind, design, best) for number, kind, design, best in told]
     return found
 
 
