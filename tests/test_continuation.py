@@ -1,4 +1,4 @@
-"""Who loads the state of an interrupted Algorithm 1 goes on as the uninterrupted one, to the last bit."""
+"""An algorithm that loads the state of an interrupted one goes on as if nothing had happened, to the last bit."""
 
 from __future__ import annotations
 

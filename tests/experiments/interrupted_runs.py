@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -41,8 +43,9 @@ def resume(folder: Path, *options: str) -> None:
         main(HopperMorph, "hopper", ["--resume", str(folder), *options])
 
 
-def cut(folder: Path, after: int, **settings: object) -> Path:
-    """Make a run whose process ended after so many checkpoints."""
+@contextmanager
+def power_cut(after: int) -> Iterator[None]:
+    """End what is done here at the checkpoint behind so many."""
     left, save = after, Checkpoints.save
 
     def saved_or_cut(checkpoints: Checkpoints, notes: dict) -> None:
@@ -55,5 +58,11 @@ def cut(folder: Path, after: int, **settings: object) -> Path:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Checkpoints, "save", saved_or_cut)
         with pytest.raises(PowerCut):
-            run(folder, **settings)
+            yield
+
+
+def cut(folder: Path, after: int, **settings: object) -> Path:
+    """Make a run whose process ended after so many checkpoints."""
+    with power_cut(after):
+        run(folder, **settings)
     return folder

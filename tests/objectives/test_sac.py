@@ -91,7 +91,7 @@ def torchrl_loss(policy, critics, loss: CoImSACLoss, *, reduction: str = "mean")
 
 
 def gradients(loss: nn.Module, out: TensorDict) -> dict[str, list[torch.Tensor]]:
-    """Of loss_actor and loss_qvalue, as far as there is any."""
+    """Gradients of loss_actor and of loss_qvalue; a parameter without one is left out."""
     parameters = list(loss.parameters())
     both = (torch.autograd.grad(out[k], parameters, allow_unused=True) for k in ("loss_actor", "loss_qvalue"))
     return {key: [g for g in grads if g is not None] for key, grads in zip(("actor", "qvalue"), both)}

@@ -37,7 +37,7 @@ env.reset()
 env.render(0, width=64, height=48)
 """
 DRAWING = 60  # s
-REPLAY = 1.4  # GiB, of 6.5 million rows: `make bench`, row memory
+REPLAY = 1.4  # GB, of 6.5 million rows: `make bench`, row memory
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,8 @@ def opengl() -> Finding:
 
 def room() -> Finding:
     """Free disk of the working directory, where ``runs/`` is made."""
-    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
     lack = ""
     if free < 2 * REPLAY:
-        lack = f"{free:.1f} GiB of disk: a run of the paper's protocol keeps a replay of {REPLAY} GiB"
-    return Finding("disk", f"{free:.0f} GiB free here", lack)
+        lack = f"{free:.1f} GB of disk: a run of the paper's protocol keeps a replay of {REPLAY} GB"
+    return Finding("disk", f"{free:.0f} GB free here", lack)

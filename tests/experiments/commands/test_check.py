@@ -39,8 +39,8 @@ def test_one_core_a_missing_compiler_and_a_full_disk_are_lacks(monkeypatch: pyte
     assert "the learners take turns" in check.processor().lack
     monkeypatch.setenv("CXX", "no-such-compiler")
     assert "no C++ compiler (no-such-compiler) was found" in check.compiler().lack
-    monkeypatch.setattr(check.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**30))
-    assert check.room().lack.startswith("1.0 GiB of disk")
+    monkeypatch.setattr(check.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e9))
+    assert check.room().lack.startswith("1.0 GB of disk")
 
 
 def test_opengl_that_does_not_draw_is_a_lack(monkeypatch: pytest.MonkeyPatch) -> None:

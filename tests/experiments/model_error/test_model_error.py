@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from interrupted_runs import TINY, PowerCut, no_picture
+from interrupted_runs import TINY, no_picture, power_cut
 from interrupted_runs import run as run_alone
 from matplotlib.collections import QuadMesh
 from tensordict import TensorDict
@@ -22,7 +22,6 @@ from coim.experiments.figures import design_plane, error_curves
 from coim.experiments.frames import read_frame
 from coim.experiments.model_error.run import probe, write_design_space
 from coim.experiments.model_error.tables import CHANGES, ERRORS
-from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.settings import Settings
 from tests.experiments.made_up_study import check_words
 
@@ -91,19 +90,8 @@ def test_everything_is_measured_for_three_predictions_and_the_next_design_before
 def test_a_stopped_measurement_goes_on_by_the_same_line_to_the_same_numbers(
     study: Path, tmp_path: Path, saves: int
 ) -> None:
-    left, save = saves, Checkpoints.save
-
-    def saved_or_cut(checkpoints: Checkpoints, notes: dict) -> None:
-        nonlocal left
-        if left == 0:
-            raise PowerCut
-        left -= 1
-        save(checkpoints, notes)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Checkpoints, "save", saved_or_cut)
-        with pytest.raises(PowerCut):
-            measure(tmp_path / "cut")
+    with power_cut(saves):
+        measure(tmp_path / "cut")
     measure(tmp_path / "cut")
     for name in ("model_error.csv", "design_space.csv", "evaluations.csv"):
         assert read(tmp_path / "cut" / name) == read(study / "model_error" / name)
