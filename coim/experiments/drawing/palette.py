@@ -19,7 +19,16 @@ BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "
 KINDS = {"first": (BLUE, "o"), "optimised": (VERMILION, "^"), "random": (GREEN, "s"), "fixed": (ORANGE, "D")}
 # A line style of matplotlib; a tuple is an offset, then lengths of lines and gaps.
 Dashes = str | tuple[float, tuple[float, ...]]
-DASHES: tuple[Dashes, ...] = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (6, 1, 1, 1)))
+DASHES: tuple[Dashes, ...] = (
+    "-",
+    "--",
+    "-.",
+    ":",
+    (0, (3, 1, 1, 1, 1, 1)),
+    (0, (8, 2)),
+    (0, (6, 1, 1, 1)),
+    (0, (2, 3)),
+)
 CHARACTERS = 120  # that fit side by side in a legend over the page's width
 # The circle of Fig. 4.
 CIRCLE: dict[str, Any] = {

@@ -47,11 +47,13 @@ def plots(study: Path) -> Iterator[Plot]:
 
 
 def families(there: Sequence[str]) -> dict[str, list[str]]:
-    """Figures beside the paper's: each family with an arm that the paper does not draw, with the family's baselines."""
+    """Figures beside the paper's: each family with an arm that no other figure draws, with the family's baselines."""
     figures = {}
     for family in FAMILIES:
         own = [name for name in there if ARMS[name].family == family]
-        if {*own} - {arm for arms in PAPER.values() for arm in arms}:
+        elsewhere = {arm for arms in PAPER.values() for arm in arms}
+        elsewhere |= {b for name in there if ARMS[name].family != family for b in ARMS[name].baselines}
+        if {*own} - elsewhere:
             figures[f"best_returns_{family}"] = in_order([*own, *(b for name in own for b in ARMS[name].baselines)])
     return figures
 

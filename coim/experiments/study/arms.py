@@ -14,12 +14,24 @@ from typing import Any, Literal
 from matplotlib.colors import is_color_like
 from matplotlib.lines import Line2D
 
-from coim.experiments.drawing.palette import BLACK, BLUE, DASHES, GREEN, GREY, ORANGE, PURPLE, VERMILION, Dashes
+from coim.experiments.drawing.palette import (
+    BLACK,
+    BLUE,
+    DASHES,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    Dashes,
+)
 
-Family = Literal["imagination", "bodies"]
+Family = Literal["imagination", "bodies", "grounded"]
 FAMILIES: dict[Family, str] = {
     "imagination": "arms that differ in what they imagine",
     "bodies": "arms that differ in how they choose the next body",
+    "grounded": "arms that choose bodies as `grounded` does and differ in what they imagine",
 }
 
 
@@ -62,11 +74,14 @@ class Arm:
 
     @property
     def dashes(self) -> Dashes:
-        """Line style: solid without a baseline, else by the place among the arms of the family that have one."""
+        """Line style: solid without a baseline, else one that no arm in the figure of the family has."""
         if not self.baselines:
             return DASHES[0]
-        family = [arm.name for arm in ARMS.values() if arm.family == self.family and arm.baselines]
-        return DASHES[1:][family.index(self.name) % len(DASHES[1:])]
+        family = [arm for arm in ARMS.values() if arm.family == self.family and arm.baselines]
+        others = {name for arm in family for name in arm.baselines if ARMS[name].family != self.family}
+        taken = [DASHES[0], *(ARMS[name].dashes for name in others)]
+        free = [dashes for dashes in DASHES if dashes not in taken]
+        return free[family.index(self) % len(free)]
 
     @property
     def line(self) -> dict[str, Any]:
@@ -100,6 +115,9 @@ def by_name(*arms: Arm) -> dict[str, Arm]:
                 raise ValueError(f"arms {looks[look]} and {arm.name} look alike ({' '.join(look)}); change one of them")
     return found
 
+
+GROUNDED = {"chosen_by": "posterior", "value_states": "matched", "value_over": "visited"}
+ANCHORED = {"imagined_states": "matched", "anchored": True}
 
 # All arms of a seed share the first designs, the initial weights and the reset noise.
 # The paper's colours as far as the palette has them: none blue, known red, noisy yellow, random black.
@@ -197,16 +215,65 @@ ARMS = by_name(
     Arm(
         name="grounded",
         words="imagines nothing and searches the same process with Eq. 5 over visited states as its mean",
-        settings={
-            "imagine": "none",
-            "chosen_by": "posterior",
-            "value_states": "matched",
-            "value_over": "visited",
-        },
+        settings={"imagine": "none", **GROUNDED},
         baselines=("none", "random-bodies", "returns"),
         family="bodies",
         colour=BLACK,
         marker="p",
+    ),
+    Arm(
+        name="grounded-known",
+        words="chooses bodies as grounded does and imagines the designs tried so far",
+        settings={"imagine": "known", **GROUNDED},
+        baselines=("grounded",),
+        family="grounded",
+        colour=VERMILION,
+        marker="<",
+    ),
+    Arm(
+        name="grounded-noisy",
+        words="chooses bodies as grounded does and imagines the designs tried so far with noise added",
+        settings={"imagine": "noisy", **GROUNDED},
+        baselines=("grounded", "grounded-known"),
+        family="grounded",
+        colour=ORANGE,
+        marker="8",
+    ),
+    Arm(
+        name="grounded-random",
+        words="chooses bodies as grounded does and imagines uniformly random designs",
+        settings={"imagine": "random", **GROUNDED},
+        baselines=("grounded", "grounded-known"),
+        family="grounded",
+        colour=GREEN,
+        marker="D",
+    ),
+    Arm(
+        name="grounded-noisy-anchored",
+        words="as grounded-noisy, from states that the body can be in and anchored at real transitions",
+        settings={"imagine": "noisy", **ANCHORED, **GROUNDED},
+        baselines=("grounded", "grounded-noisy"),
+        family="grounded",
+        colour=PURPLE,
+        marker=">",
+    ),
+    Arm(
+        name="grounded-random-anchored",
+        words="as grounded-random, from states that the body can be in and anchored at real transitions",
+        settings={"imagine": "random", **ANCHORED, **GROUNDED},
+        baselines=("grounded", "grounded-random"),
+        family="grounded",
+        colour=SKY,
+        marker="H",
+    ),
+    Arm(
+        name="grounded-governed",
+        words="as grounded-random-anchored, as much as the model's measured error allows",
+        settings={"imagine": "random", **ANCHORED, "governed": True, **GROUNDED},
+        baselines=("grounded", "grounded-random-anchored"),
+        family="grounded",
+        colour=BLUE,
+        marker="*",
     ),
 )
 

@@ -5,6 +5,28 @@ from __future__ import annotations
 from coim.experiments.study.definition import Block, Study
 
 SEEDS = tuple(range(10))
+# A method is developed on the first seeds and confirmed on the others, by which nothing may be chosen.
+DEVELOP, CONFIRM = tuple(range(5)), tuple(range(20, 30))
+
+
+def bodies(name: str, seeds: tuple[int, ...]) -> Study:
+    """Ways of choosing bodies, all without imagination."""
+    arms = ("none", "random-bodies", "matched", "visited", "returns", "grounded")
+    return Study(name=name, environments=("hopper",), arms=arms, seeds=seeds, protocol="pilot")
+
+
+def imagining(name: str, seeds: tuple[int, ...]) -> Study:
+    """What to imagine where bodies are chosen as `grounded` does; on the Half-Cheetah fewer arms, to save hours."""
+    kept = ("grounded", "grounded-known", "grounded-random-anchored", "grounded-governed")
+    return Study(
+        name=name,
+        environments=("hopper",),
+        arms=(*kept, "grounded-noisy", "grounded-random", "grounded-noisy-anchored"),
+        seeds=seeds,
+        protocol="pilot",
+        blocks=(Block(environments=("half_cheetah",), arms=kept, seeds=seeds),),
+    )
+
 
 STUDIES = {
     study.name: study
@@ -32,6 +54,10 @@ STUDIES = {
             protocol="preview",
             blocks=(Block(environments=("half_cheetah",), arms=("none", "known"), seeds=(0, 1, 2)),),
         ),
+        bodies("bodies-develop", DEVELOP),
+        bodies("bodies", CONFIRM),
+        imagining("imagining-develop", DEVELOP),
+        imagining("imagining", CONFIRM),
         Study(
             name="smoke",
             environments=("hopper",),

@@ -129,6 +129,14 @@ def test_other_arms_have_a_figure_with_their_family_and_its_baselines(study: Pat
     }
 
 
+def test_a_baseline_that_another_family_draws_has_no_figure_for_itself(tmp_path: Path) -> None:
+    for arm in ("grounded", "grounded-known"):
+        write_cell(tmp_path, f"hopper-forward-{arm}-0", [1, 2, 3, 4])
+    plots = drawn(tmp_path)
+    assert {row["arm"] for row in plots["best_returns_grounded"].rows} == {"grounded", "grounded-known"}
+    assert "best_returns_bodies" not in plots
+
+
 def test_several_environments_and_tasks_stand_in_one_figure(study: Path) -> None:
     narrow = drawn(study)["figure_3_best_returns"]
     for task in ("forward", "backward"):

@@ -139,6 +139,25 @@ def test_the_preview_has_the_papers_networks_batches_and_updates() -> None:
     assert len(STUDIES["preview"].cells()) == 4 * 5 + 2 * 3
 
 
+def test_a_method_is_confirmed_by_the_study_it_was_developed_on_with_other_seeds() -> None:
+    for name in ("bodies", "imagining"):
+        develop, confirm = STUDIES[f"{name}-develop"], STUDIES[name]
+        own = [
+            {(cell.environment, cell.arm, dataclasses.replace(cell.settings, name="", seed=0)) for cell in made.cells()}
+            for made in (develop, confirm)
+        ]
+        assert own[0] == own[1]
+        assert not {*develop.seeds} & {*confirm.seeds}
+    counts = [len(STUDIES[name].cells()) for name in ("bodies-develop", "bodies", "imagining-develop", "imagining")]
+    assert counts == [6 * 5, 6 * 10, (7 + 4) * 5, (7 + 4) * 10]
+
+
+def test_an_arm_that_imagines_with_grounded_bodies_differs_from_its_namesake_in_the_choice_alone() -> None:
+    choice = {name: ARMS["grounded"].settings[name] for name in ("chosen_by", "value_states", "value_over")}
+    for imagine in ("known", "noisy", "random"):
+        assert ARMS[f"grounded-{imagine}"].settings == ARMS[imagine].settings | choice
+
+
 def test_the_ledger_keeps_what_is_finished_and_lets_all_else_wait(tmp_path: Path) -> None:
     cells = study().cells()
     ledger = Ledger(tmp_path / "ledger.csv", cells)
