@@ -7,20 +7,25 @@ import dataclasses
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Literal
 
 import tyro
 from pydantic import ValidationError
 
-from coim.experiments.run.effect import refuse_without_effect
+from coim.experiments.run.effect import refuse_without_effect, without_effect
 from coim.experiments.run.pydantic_errors import sentence
 from coim.experiments.run.resume import refuse_changes, saved_settings
-from coim.experiments.run.settings import PRESETS, Settings, given, option
+from coim.experiments.run.settings import FIELDS, METHODS, PRESETS, Settings, given, option
 from coim.run_folder import RENAMED
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Written(Settings):
     """Settings as they are written on a command line: not validated, so that an error can name the option."""
+
+    method: Literal["paper", "grounded"] | None = None
+    """Way to choose the next body. paper: maximise Eq. 5 as printed. grounded: a Gaussian process over the returns
+    earned so far, with Eq. 5 over visited states as its mean. By default that of the preset: grounded in quick."""
 
     def __post_init__(self) -> None:
         pass
@@ -29,7 +34,7 @@ class Written(Settings):
 def parse(
     program: str, description: str, arguments: Sequence[str] | None = None, *, read: Collection[str] = ()
 ) -> Settings:
-    """Read the command line; ``--preset`` only moves the defaults of everything else.
+    """Read the command line; ``--preset`` and ``--method`` only move the defaults of everything else.
 
     Args:
         program: shown in the usage line.
@@ -44,22 +49,36 @@ def parse(
     arguments = renamed(sys.argv[1:] if arguments is None else arguments)
     first = argparse.ArgumentParser(prog=program, usage="%(prog)s [OPTIONS]", add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="paper")
+    first.add_argument("--method")
     first.add_argument("--resume", type=Path)
     known = first.parse_known_args(arguments)[0]
-    default = PRESETS.get(known.preset, PRESETS["paper"])  # an unknown name is refused below, with those that exist
+    # An unknown name is refused below, with those that exist.
+    default = PRESETS.get(known.preset, PRESETS["paper"])
     if known.resume is not None:
         default = saved_settings(known.resume)
-    default = Written(**vars(default))
+    before, default = default, Written(**vars(default) | METHODS.get(known.method, {}))
     written = tyro.cli(Written, prog=program, description=description, args=arguments, default=default)
     try:
-        settings = Settings(**vars(written))
+        settings = Settings(**{name: value for name, value in vars(written).items() if name in FIELDS})
         refuse_without_effect(settings, given(arguments), called=option, read=read)
+        refuse_idle_method(known.method, settings)
     except ValueError as error:
         refused = error.__cause__
         first.error(sentence(refused, Settings, called=option) if isinstance(refused, ValidationError) else str(error))
     if known.resume is not None:
-        refuse_changes(default, settings)
+        refuse_changes(before, settings)
     return settings
+
+
+def refuse_idle_method(method: str | None, settings: Settings) -> None:
+    """Refuse a method beside settings that let it change nothing.
+
+    Raises:
+        ValueError: with a sentence.
+    """
+    idle = without_effect(settings, called=option)
+    if method is not None and METHODS[method].keys() <= idle.keys():
+        raise ValueError(f"--method {method} has no effect with --bodies {settings.bodies}; leave it out")
 
 
 def renamed(words: Sequence[str]) -> list[str]:

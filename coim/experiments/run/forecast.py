@@ -25,12 +25,13 @@ class Work:
     Attributes:
         episodes: of training, each with its updates and its evaluation.
         searches: designs that are to be found by Eq. 5.
-        updates: of all networks after an episode.
+        learning: updates after an episode, each times the hidden units of its networks. An update takes longer by a
+            power of the units between 1 and 2, so that smaller networks are at least as quick as this says.
     """
 
     episodes: int
     searches: int
-    updates: int
+    learning: int
 
 
 def work_of(body: type[MorphEnv], settings: Settings, *, episodes: int = 0, designs: int = 0) -> Work:
@@ -45,13 +46,16 @@ def work_of(body: type[MorphEnv], settings: Settings, *, episodes: int = 0, desi
     Example:
         >>> from coim import HopperMorph
         >>> work_of(HopperMorph, Settings())  # 5 x 300 + 50 x 100 episodes; every other later design is a random one
-        Work(episodes=6500, searches=25, updates=1500)
+        Work(episodes=6500, searches=25, learning=3375000)
     """
     searched = range(len(first_designs(body, settings)), settings.num_designs, 2) if settings.bodies == "search" else ()
     return Work(
         episodes=sum(episodes_of_designs(body, settings)) - episodes,
         searches=sum(index >= designs for index in searched),
-        updates=settings.individual_updates + settings.population_updates + settings.model_updates,
+        learning=(settings.individual_updates + settings.population_updates)
+        * (1 + settings.num_critics)
+        * sum(settings.num_cells)
+        + settings.model_updates * settings.num_members * sum(settings.model_cells),
     )
 
 
@@ -125,9 +129,9 @@ class Forecast:
         return told
 
     def _quick_seconds(self, quick: Work, episode: float) -> float:
-        """The same episodes, with other numbers of them and of updates after each; its searches are short."""
+        """The same episodes, with other numbers of them and other learning after each; its searches are short."""
         learning = statistics.fmean(self._learning)
-        return quick.episodes * (episode - learning + learning * quick.updates / max(1, self._left.updates))
+        return quick.episodes * (episode - learning + learning * quick.learning / max(1, self._left.learning))
 
 
 def in_words(seconds: float) -> str:

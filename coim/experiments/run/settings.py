@@ -40,7 +40,7 @@ class Settings:
 
     # -- what is asked ------------------------------------------------------------------------------------------------
     preset: Literal["paper", "quick"] = "paper"
-    """paper: the protocol of Sec. 6.1. quick: fewer designs, episodes and updates, for a first look."""
+    """paper: the protocol of Sec. 6.1. quick: 8 bodies and small networks, for a first look."""
     task: Task = "forward"
     """Direction in which speed is rewarded (Fig. 1, first and second row)."""
     imagine: Literal["known", "noisy", "random", "none"] = "known"
@@ -145,7 +145,7 @@ class Settings:
     products: Literal["auto", "onednn", "torch"] = "auto"
     """Library that multiplies on the CPU; auto takes the fastest known. A resumed run keeps the one it has."""
     compile: bool = False
-    """Compile the gradients with torch.compile: up to a minute at the start, then faster. On in preset paper."""
+    """Compile the gradients with torch.compile: up to a minute at the start, then faster. On in both presets."""
     device: str = "cpu"
     """Device of the networks: cpu, cuda, cuda:1, ..."""
     replay_device: Literal["same", "cpu"] = "same"
@@ -176,16 +176,23 @@ class Settings:
         batch_parts(self.batch_size, imagined=self.individual_imagined_share, other=self.individual_mix)
 
 
+# Ways to choose the next body, by name: what `--method` sets. docs/results/choosing.md and bodies.md compare them.
+METHODS: dict[str, dict[str, Any]] = {
+    "paper": {"chosen_by": "value", "value_states": "stored", "value_over": "start"},
+    "grounded": {"chosen_by": "posterior", "value_states": "matched", "value_over": "visited"},
+}
+
 QUICK = Settings(
     preset="quick",
+    **METHODS["grounded"],
     num_designs=8,
-    first_episodes=4,
-    episodes=4,
-    individual_updates=400,
-    population_updates=100,
-    model_updates=60,
-    num_particles=100,
-    num_iterations=30,
+    first_episodes=6,
+    episodes=6,
+    num_cells=(64, 64, 64),
+    model_cells=(200, 200, 200),
+    model_updates=100,
+    search="gradient",
+    compile=True,
     name="quick",
 )
 

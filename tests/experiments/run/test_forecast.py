@@ -43,8 +43,10 @@ def after(forecast: Forecast, clock: Clock, *steps: tuple[EpisodeDone | DesignCh
 
 
 def test_the_papers_protocol_is_so_many_episodes_and_searches() -> None:
-    assert work_of(HopperMorph, PRESETS["paper"]) == Work(episodes=5 * 300 + 50 * 100, searches=25, updates=1500)
-    assert work_of(HopperMorph, QUICK) == Work(episodes=8 * 4, searches=2, updates=560)
+    assert work_of(HopperMorph, PRESETS["paper"]) == Work(
+        episodes=5 * 300 + 50 * 100, searches=25, learning=1250 * 3 * 600 + 250 * 3 * 1500
+    )
+    assert work_of(HopperMorph, QUICK) == Work(episodes=8 * 6, searches=2, learning=1250 * 3 * 192 + 100 * 3 * 600)
     # 6 of 7 designs are chosen, the one that was searched for among them.
     part = work_of(HopperMorph, Settings(num_designs=7, first_episodes=2, episodes=1), episodes=10, designs=6)
     assert (part.episodes, part.searches) == (2, 0)
