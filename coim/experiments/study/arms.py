@@ -26,6 +26,7 @@ from coim.experiments.drawing.palette import (
     VERMILION,
     Dashes,
 )
+from coim.experiments.run.settings import METHODS
 
 Family = Literal["imagination", "bodies", "grounded"]
 FAMILIES: dict[Family, str] = {
@@ -116,7 +117,6 @@ def by_name(*arms: Arm) -> dict[str, Arm]:
     return found
 
 
-GROUNDED = {"chosen_by": "posterior", "value_states": "matched", "value_over": "visited"}
 ANCHORED = {"imagined_states": "matched", "anchored": True}
 
 # All arms of a seed share the first designs, the initial weights and the reset noise.
@@ -215,7 +215,7 @@ ARMS = by_name(
     Arm(
         name="grounded",
         words="imagines nothing and searches the same process with Eq. 5 over visited states as its mean",
-        settings={"imagine": "none", **GROUNDED},
+        settings={"imagine": "none", **METHODS["grounded"]},
         baselines=("none", "random-bodies", "returns"),
         family="bodies",
         colour=BLACK,
@@ -224,7 +224,7 @@ ARMS = by_name(
     Arm(
         name="grounded-known",
         words="chooses bodies as grounded does and imagines the designs tried so far",
-        settings={"imagine": "known", **GROUNDED},
+        settings={"imagine": "known", **METHODS["grounded"]},
         baselines=("grounded",),
         family="grounded",
         colour=VERMILION,
@@ -233,7 +233,7 @@ ARMS = by_name(
     Arm(
         name="grounded-noisy",
         words="chooses bodies as grounded does and imagines the designs tried so far with noise added",
-        settings={"imagine": "noisy", **GROUNDED},
+        settings={"imagine": "noisy", **METHODS["grounded"]},
         baselines=("grounded", "grounded-known"),
         family="grounded",
         colour=ORANGE,
@@ -242,7 +242,7 @@ ARMS = by_name(
     Arm(
         name="grounded-random",
         words="chooses bodies as grounded does and imagines uniformly random designs",
-        settings={"imagine": "random", **GROUNDED},
+        settings={"imagine": "random", **METHODS["grounded"]},
         baselines=("grounded", "grounded-known"),
         family="grounded",
         colour=GREEN,
@@ -251,7 +251,7 @@ ARMS = by_name(
     Arm(
         name="grounded-noisy-anchored",
         words="as grounded-noisy, from states that the body can be in and anchored at real transitions",
-        settings={"imagine": "noisy", **ANCHORED, **GROUNDED},
+        settings={"imagine": "noisy", **ANCHORED, **METHODS["grounded"]},
         baselines=("grounded", "grounded-noisy"),
         family="grounded",
         colour=PURPLE,
@@ -260,7 +260,7 @@ ARMS = by_name(
     Arm(
         name="grounded-random-anchored",
         words="as grounded-random, from states that the body can be in and anchored at real transitions",
-        settings={"imagine": "random", **ANCHORED, **GROUNDED},
+        settings={"imagine": "random", **ANCHORED, **METHODS["grounded"]},
         baselines=("grounded", "grounded-random"),
         family="grounded",
         colour=SKY,
@@ -269,7 +269,7 @@ ARMS = by_name(
     Arm(
         name="grounded-governed",
         words="as grounded-random-anchored, as much as the model's measured error allows",
-        settings={"imagine": "random", **ANCHORED, "governed": True, **GROUNDED},
+        settings={"imagine": "random", **ANCHORED, "governed": True, **METHODS["grounded"]},
         baselines=("grounded", "grounded-random-anchored"),
         family="grounded",
         colour=BLUE,

@@ -276,7 +276,7 @@ def test_what_no_node_has_is_said_instead_of_waited_for(tmp_path: Path, monkeypa
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["previw"], "'previw' is no study: there are paper, preview, smoke, or name a file that ends in .json"),
+        (["previw"], "'previw' is no study: there are paper, preview, bodies-develop, bodies, "),
         (["smoke", "--cpus", "0"], "--cpus is 0, a cell needs at least 1"),
         (["smoke", "--gpus", "-1"], "--gpus is -1"),
         (["smoke", "--workers", "-1"], "--workers is -1"),
