@@ -4,6 +4,8 @@ An arm has found the designs that it chose by Eq. 5 (kind "optimised"). The firs
 the random ones are no merit of an arm. From each run, the best half of these designs, by their best return in the
 study, is trained with plain SAC: Algorithm 1 with this one design, no population and nothing imagined. The best half
 of all runs together would come from few runs, and a test of arms would take the luck of these runs for the arm's merit.
+To compare an arm with one that does not search, ``--of all --most 1`` takes the best body of each run instead, whatever
+its kind.
 
 ``retrained/designs.csv`` in the study's folder names the designs. They are not chosen again when the study grows. The
 file also has the number of the arm's runs that were over at that time, and how many of their designs were kept. Beside

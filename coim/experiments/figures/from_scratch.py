@@ -62,11 +62,21 @@ def rules(rows: pd.DataFrame, listed: pd.DataFrame, lost: int) -> list[str]:
         counted += f"; {lost} left out, as no retraining of their environment and task has a return"
     return [
         f"Training takes {episodes} episodes of plain SAC from scratch, with a seed of its own for each design.",
-        f"Designs are the best of those that Eq. 5 chose in each run, by their return in the study after {in_study} "
-        "episodes. First and random designs are left out, even where they were better. A body that comes again counts "
-        "again.",
+        f"Designs are the best of {among(listed)} in each run, by their return in the study after {in_study} episodes. "
+        + ("" if is_of_all(listed) else "First and random designs are left out, even where they were better. ")
+        + "A body that comes again counts again.",
         f"{counted}.",
     ]
+
+
+def is_of_all(listed: pd.DataFrame) -> bool:
+    """Whether designs of all kinds were candidates."""
+    return "all" in {*listed["of"]}
+
+
+def among(listed: pd.DataFrame) -> str:
+    """What the designs were chosen from, in words."""
+    return "all that were built" if is_of_all(listed) else "those that the search found"
 
 
 def early(runs: Runs, listed: pd.DataFrame) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 import tyro
@@ -21,7 +21,8 @@ from coim.experiments.run.resume import saved_settings
 from coim.experiments.study.definition import Cell
 from coim.experiments.study.runs import CHOSEN, Place, Run, Runs
 
-RULE = {"top": 0.5, "most": 18}  # of Fig. 2
+RULE: dict[str, Any] = {"top": 0.5, "most": 18, "of": "optimised"}  # of Fig. 2
+WORDS = {"optimised": "an optimised design", "all": "a design"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +34,12 @@ class Retrain:
     arms: tuple[str, ...] = ()
     """Arms of the study whose designs are retrained; by default all that search for designs (Fig. 2: none, known)."""
     top: float | None = None
-    """Share of each run's optimised designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
+    """Share of each run's designs, the best ones; by default what was chosen by before, or 0.5 (Fig. 2)."""
     most: int | None = None
     """At most so many of each arm, environment and task, but one of each run; by default as before, or 18 (Fig. 2)."""
+    of: Literal["optimised", "all"] | None = None
+    """Designs to choose from: those that the search found, or all that the run built, so that arms without a search
+    have some too. With --most 1 the best body of each run. By default as before, or optimised (Fig. 2)."""
     episodes: int | None = None
     """Training episodes on each; by default as many as the study gave to a first design."""
     workers: int = 0
@@ -74,7 +78,7 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> pd.DataFrame:
         All rows of the file, with the columns of `CHOSEN`.
 
     Raises:
-        ValueError: if an arm is none of the study's, none has an optimised design, or what stands in the file was
+        ValueError: if an arm is none of the study's, none has a design to choose from, or what stands in the file was
             chosen by another rule.
     """
     listed = read_frame(path, CHOSEN)
@@ -88,27 +92,30 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> pd.DataFrame:
         tables += [best_designs(runs, place, arm, rule) for arm in arms if arm not in there]
     tables = [table for table in tables if len(table)]
     if not tables:
-        raise ValueError(f"no run of {', '.join(arms)} has an optimised design yet; let the study go on")
+        raise ValueError(
+            f"no run of {', '.join(arms)} has {WORDS[rule['of']]} yet; let the study go on"
+            + (", or choose among all designs with --of all" if rule["of"] == "optimised" else "")
+        )
     chosen = pd.concat(tables, ignore_index=True)
     for place, arm in itertools.product(runs.places, arms):
         if arm in runs.arms_at(place) and at(chosen, place, arm).empty:
-            print(f"{', '.join(place)}: no run of {arm} has an optimised design, there is nothing to retrain of it")
-    noted = chosen.dropna(axis="columns", how="all")  # older studies have noted less
+            print(f"{', '.join(place)}: no run of {arm} has {WORDS[rule['of']]}, there is nothing to retrain of it")
+    noted = chosen.replace("", math.nan).dropna(axis="columns", how="all")  # older studies have noted less
     cells = noted.map(lambda value: shortest(value) if isinstance(value, float) else value, na_action="ignore")
     write_whole(path, as_csv(list(cells.columns), rows_of(cells.fillna(""))))
     return chosen
 
 
-def rule_of(listed: pd.DataFrame, asked: Retrain) -> dict[str, float]:
-    """``top`` and ``most``: what is asked for, or was chosen by before.
+def rule_of(listed: pd.DataFrame, asked: Retrain) -> dict[str, Any]:
+    """``top``, ``most`` and ``of``: what is asked for, or was chosen by before.
 
     Raises:
         ValueError: if the two differ. What was chosen stays, and arms that come beside it are compared with it.
     """
-    rule: dict[str, float] = {}
+    rule: dict[str, Any] = {}
     for name, usual in RULE.items():
         wanted = getattr(asked, name)
-        used = next((type(usual)(value) for value in listed[name].dropna()), None)
+        used = next((type(usual)(value or usual) for value in listed[name].dropna()), None)
         if None not in (wanted, used) and wanted != used:
             raise ValueError(
                 f"--{name} is {wanted}, but the designs in {asked.study}/retrained were chosen by {used}; leave the "
@@ -118,15 +125,16 @@ def rule_of(listed: pd.DataFrame, asked: Retrain) -> dict[str, float]:
     return rule
 
 
-def best_designs(runs: Runs, place: Place, arm: str, rule: Mapping[str, float]) -> pd.DataFrame:
-    """The best share of what each run of an arm found in one environment and task, best first.
+def best_designs(runs: Runs, place: Place, arm: str, rule: Mapping[str, Any]) -> pd.DataFrame:
+    """The best share of what each run of an arm found or built in one environment and task, best first.
 
     Args:
         runs: of the study.
         place: environment and task.
         arm: whose designs.
         rule: ``top``, the share, and ``most``, which is divided among the runs of the arm that has most of them, so
-            that all arms select alike; where it does not come out even, the first seeds give one more.
+            that all arms select alike; where it does not come out even, the first seeds give one more. ``of`` says
+            which designs there are to choose from.
 
     Returns:
         A row for each design, with the columns of `CHOSEN`.
@@ -134,7 +142,7 @@ def best_designs(runs: Runs, place: Place, arm: str, rule: Mapping[str, float]) 
     each, more = divmod(int(rule["most"]), max(runs.planned[*place, arm] for arm in runs.arms_at(place)))
     share = Fraction(str(rule["top"]))  # 7 / 25 * 25 > 7 in floating point
     own = runs.of(place, arm)
-    found = [rows for run in own if len(rows := candidates(run))]
+    found = [rows for run in own if len(rows := candidates(run, rule["of"]))]
     if not found:
         return pd.DataFrame(columns=CHOSEN.header())
     kept = pd.concat(
@@ -143,13 +151,14 @@ def best_designs(runs: Runs, place: Place, arm: str, rule: Mapping[str, float]) 
     noted = {"over": sum(run.over for run in own), "planned": runs.planned[*place, arm]}
     noted |= {"found": sum(map(len, found)), "kept": len(kept)}
     ranked = kept.sort_values("found_return", ascending=False, kind="stable", ignore_index=True)
-    return ranked.assign(**{name: float(value) for name, value in (noted | {**rule}).items()})
+    noted |= {name: rule[name] for name in ("top", "most")}
+    return ranked.assign(**{name: float(value) for name, value in noted.items()}, of=rule["of"])
 
 
-def candidates(run: Run) -> pd.DataFrame:
-    """Designs that Eq. 5 chose, best first, and where they come from: the columns of `CHOSEN` that are needed."""
-    rows = run.designs[run.designs["kind"] == "optimised"]
-    rows = rows.sort_values("best_return", ascending=False, kind="stable")
+def candidates(run: Run, of: str) -> pd.DataFrame:
+    """Designs, best first, and where they come from: the columns of `CHOSEN` that are needed."""
+    rows = run.designs[run.designs["kind"] == "optimised"] if of == "optimised" else run.designs
+    rows = rows.dropna(subset="best_return").sort_values("best_return", ascending=False, kind="stable")
     cell = run.record.name
     return pd.DataFrame(
         {

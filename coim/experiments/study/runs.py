@@ -39,10 +39,11 @@ CHOSEN = Layout(  # what ``coim retrain`` has chosen to train from scratch, in `
         "found_return": float,
         "over": float,  # runs of the arm that were over, and how many there were to be
         "planned": float,
-        "found": float,  # designs that Eq. 5 chose in all runs of the arm, and how many of them were kept
+        "found": float,  # candidates in all runs of the arm, and how many of them were kept
         "kept": float,
         "top": float,
         "most": float,
+        "of": str,
     },
     needed=("folder", "cell", "environment", "task", "arm", "seed", "run", "design", "xi", "found_return"),
     grows=False,

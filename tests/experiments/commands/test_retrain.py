@@ -26,7 +26,7 @@ PLACE = ("hopper", "forward")
 
 
 KINDS = ("first", "optimised", "random", "optimised", "optimised")
-RULE = {"top": 0.5, "most": 18}
+RULE = {"top": 0.5, "most": 18, "of": "optimised"}
 
 
 def found(study: Path, cell: str, *runs: tuple[float, float, float]) -> None:
@@ -55,15 +55,31 @@ def test_the_best_half_is_of_the_designs_that_eq_5_chose_in_each_run(study: Path
     assert lines[["found", "kept", "top", "most"]].drop_duplicates().to_numpy().tolist() == [[9, 6, 0.5, 18]]
     of_none = best_designs(runs, PLACE, "none", RULE)
     assert of_none[["run", "found_return"]].to_numpy().tolist() == [[1, 6], [1, 5], [0, 3], [0, 2]]
-    assert len(best_designs(runs, PLACE, "none", {"top": 1.0, "most": 18})) == 6
+    assert len(best_designs(runs, PLACE, "none", RULE | {"top": 1.0})) == 6
 
 
 def test_the_cap_is_divided_among_the_runs_alike_in_all_arms_and_at_least_one_each(study: Path) -> None:
     runs = read_runs(study)
     for most, of_none, of_known in ((3, 2, 3), (5, 4, 5), (6, 4, 6), (2, 2, 3)):  # of two runs and of three
-        rule = {"top": 1.0, "most": most}
+        rule = RULE | {"top": 1.0, "most": most}
         assert len(best_designs(runs, PLACE, "none", rule)) == of_none
         assert len(best_designs(runs, PLACE, "known", rule)) == of_known
+
+
+def test_the_best_body_of_each_run_may_be_of_any_kind(study: Path) -> None:
+    write_cell(study, "hopper-forward-random-bodies-0", (3, 9, 5), kinds=("first", "random", "random"), num_designs=3)
+    runs, path = read_runs(study), study / "chosen.csv"
+    with pytest.raises(ValueError, match=r"no run of random-bodies has an optimised design yet; .* --of all"):
+        choose(runs, path, Retrain(study=study, arms=("random-bodies",)))
+    both = choose(runs, path, Retrain(study=study, arms=("none", "random-bodies"), of="all", most=1))
+    assert both[["arm", "run", "design", "found_return"]].to_numpy().tolist() == [
+        ["none", 0, 1, 90],
+        ["none", 1, 1, 90],
+        ["random-bodies", 0, 2, 9],
+    ]
+    assert both[["found", "of"]].drop_duplicates().to_numpy().tolist() == [[10, "all"], [3, "all"]]
+    with pytest.raises(ValueError, match=r"--of is optimised, but the designs in .* were chosen by all"):
+        choose(runs, path, Retrain(study=study, of="optimised"))
 
 
 def test_a_share_of_whole_designs_is_not_rounded_up(tmp_path: Path) -> None:
@@ -73,7 +89,7 @@ def test_a_share_of_whole_designs_is_not_rounded_up(tmp_path: Path) -> None:
         num_designs=count,
     )  # fmt: skip
     assert 7 / 25 * 25 > 7  # rounded up, it would be eight
-    assert len(best_designs(read_runs(tmp_path), PLACE, "known", {"top": 7 / 25, "most": 18})) == 7
+    assert len(best_designs(read_runs(tmp_path), PLACE, "known", RULE | {"top": 7 / 25})) == 7
 
 
 def test_what_was_chosen_is_not_chosen_again_and_other_arms_come_beside_it(study: Path) -> None:
@@ -90,7 +106,7 @@ def test_a_list_of_an_older_study_keeps_its_columns(study: Path) -> None:
     path = study / "chosen.csv"
     choose(read_runs(study), path, Retrain(study=study))
     head, *lines = path.read_text().splitlines()
-    assert head.endswith("found_return,over,planned,found,kept,top,most")
+    assert head.endswith("found_return,over,planned,found,kept,top,most,of")
     older = "".join(",".join(line.split(",")[:10]) + "\n" for line in [head, *lines])
     path.write_text(older)
     choose(read_runs(study), path, Retrain(study=study))
