@@ -13,10 +13,13 @@ from typing import Self
 import mujoco
 import numpy as np
 
+from coim.envs.root import Root, find_floor
+
 PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJoCo draws with texrepeat 1 (measured)
 SHADOWS = (
     1024  # texels along a side of the shadow map; MuJoCo's 4096 take more than half of the time without a graphics card
 )
+SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
@@ -24,23 +27,30 @@ MISSING_GL = (
 
 
 class Camera:
-    """A camera that follows one body on its right side; close it, or use it in a ``with`` block.
+    """A camera that follows one body; close it, or use it in a ``with`` block.
 
     Args:
         spec: the body; it is not changed.
         width: pixels.
         height: pixels.
+        root: how the body moves.
+        name: a camera of the file; by default its first one, or one on the right side of the body that follows it.
 
     Raises:
+        ValueError: if the file has no camera of that name.
         RuntimeError: if there is no OpenGL to draw with; the message says what to install and set.
     """
 
-    def __init__(self, spec: mujoco.MjSpec, *, width: int, height: int) -> None:
+    def __init__(self, spec: mujoco.MjSpec, *, width: int, height: int, root: Root, name: str | None = None) -> None:
+        self._travelled = root.unseen
         self._model = _dress(spec, width, height).compile()
         self._data = mujoco.MjData(self._model)
         self._view = mujoco.MjvCamera()
         mujoco.mjv_defaultFreeCamera(self._model, self._view)
-        self._view.azimuth, self._view.elevation = 90.0, -8.0
+        self._view.azimuth, self._view.elevation = 90.0, -8.0 if root.kind == "planar" else -25.0
+        if name is not None or self._model.ncam:
+            self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self._view.fixedcamid = _camera_number(self._model, name)
         try:
             with warnings.catch_warnings():  # glfw warns about the missing screen before mujoco raises
                 warnings.simplefilter("ignore")
@@ -52,14 +62,15 @@ class Camera:
         """Draw the body in a pose.
 
         Args:
-            qpos: joint positions, ``[nq]``; the first one is the distance travelled in m.
+            qpos: joint positions, ``[nq]``; the first ones are the place on the ground in m.
 
         Returns:
             The picture, ``[height, width, 3]`` uint8.
         """
         self._data.qpos[:] = qpos
         # Draw the body within one period of the floor: it looks the same, and stays on the floor and in the light.
-        self._data.qpos[0] = self._view.lookat[0] = qpos[0] % PERIOD
+        for axis in range(self._travelled):
+            self._data.qpos[axis] = self._view.lookat[axis] = qpos[axis] % PERIOD
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._view)
         return self._renderer.render()
@@ -78,20 +89,24 @@ class Camera:
 def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
     """Return a copy with a sky, a floor of 1 m squares, and an off-screen buffer of the size of the picture."""
     spec = spec.copy()
+    floor = find_floor(spec.compile())
     spec.visual.global_.offwidth = width
     spec.visual.global_.offheight = height
     spec.visual.quality.shadowsize = SHADOWS
+    if all(texture.type != SKY for texture in spec.textures):
+        spec.add_texture(
+            name="coim sky",
+            type=SKY,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.75, 0.85, 0.95],
+            rgb2=[1.0, 1.0, 1.0],
+            width=64,
+            height=64,
+        )
+    if floor is None:
+        return spec
     spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.75, 0.85, 0.95],
-        rgb2=[1.0, 1.0, 1.0],
-        width=64,
-        height=64,
-    )
-    spec.add_texture(
-        name="chequers",
+        name="coim chequers",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=[0.62, 0.68, 0.62],
@@ -99,7 +114,15 @@ def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
         width=128,
         height=128,
     )
-    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[2 / PERIOD, 2 / PERIOD])
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "chequers"
-    spec.geom("floor").material = "floor"
+    tiles = spec.add_material(name="coim floor", texuniform=True, texrepeat=[2 / PERIOD, 2 / PERIOD])
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "coim chequers"
+    spec.geoms[floor].material = "coim floor"
     return spec
+
+
+def _camera_number(model: mujoco.MjModel, name: str | None) -> int:
+    """Return the number of a camera of the file, by default of the first one."""
+    cameras = [model.camera(number).name for number in range(model.ncam)]
+    if name is not None and name not in cameras:
+        raise ValueError(f"CAMERA is {name!r}, and the file has the cameras {cameras}; choose one of them, or None")
+    return 0 if name is None else cameras.index(name)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,9 +22,17 @@ from torch import Tensor
 
 from coim.envs.camera import Camera
 from coim.envs.kinematics import Kinematics
-from coim.envs.planar import check_planar
-from coim.envs.simulation import PITCH, ROOT_X, Simulations
+from coim.envs.root import Root, give_floor, read_root
+from coim.envs.simulation import Simulations
 from coim.randomness import restore_generator
+
+Bounds = tuple[float, float] | tuple[tuple[float, float], ...]
+
+
+def uniform_and_normal(num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw one row's noise as Gymnasium does for its cheetah and its ant: uniform in [-1, 1], and standard normal."""
+    positions = 2 * torch.rand(num_positions, generator=generator, dtype=torch.float64, device="cpu") - 1
+    return positions, torch.randn(num_velocities, generator=generator, dtype=torch.float64, device="cpu")
 
 
 class Fleet:
@@ -32,35 +41,42 @@ class Fleet:
     Attributes:
         simulations: the simulations themselves: live positions and velocities, and the compiled bodies.
         num_broken: how often the simulation of each row has broken, ``[K]`` int64.
+        root: how the robot moves, and where its place stands in its positions.
     """
 
     ASSET: ClassVar[str]  # XML file in assets/, or an absolute path
     DESIGN_SIZE: ClassVar[int]
     DESIGN_NAMES: ClassVar[tuple[str, ...]] = ()  # names of the design's entries; see design_names()
-    DESIGN_BOUNDS: ClassVar[tuple[float, float]]
+    DESIGN_BOUNDS: ClassVar[Bounds]  # lowest and highest factor, of all entries or a pair for each
     FRAME_SKIP: ClassVar[int]  # simulation steps in an environment step
     RESET_NOISE: ClassVar[float]
     OBSERVATION_SCALE: ClassVar[tuple[float, ...]]  # standard deviations under random actions at xi = 1, rounded
     FIRST_DESIGNS: ClassVar[tuple[tuple[float, ...], ...]]  # the designs that a run tries first
+    CAMERA: ClassVar[str | None] = None  # name of a camera of the file for pictures; by default its first one, or ours
 
-    _first_position = 1  # index of the first observed entry of qpos: the root's x is not observed
-
+    root: Root
     reset_noise: float
+    _observes_place = False  # whether the robot's place on the ground is observed
 
     def _begin(self, num_runs: int, num_threads: int) -> None:
         """Build K unit bodies."""
         self._num_threads = num_threads
         self._design = torch.ones(num_runs, self.DESIGN_SIZE, dtype=torch.float32, device="cpu")
         self.simulations = self._simulate()
-        check_planar(self.simulations.model(0), type(self).__name__)
+        model = self.simulations.model(0)
+        self.root = read_root(model, type(self).__name__)
+        low, high = model.actuator_ctrlrange.T
+        self._range = None if (low == -1).all() and (high == 1).all() else ((low + high) / 2, (high - low) / 2)
         self._observation = self._see()
         self._step_count = torch.zeros(num_runs, 1, dtype=torch.int64, device="cpu")
         self.num_broken = torch.zeros(num_runs, dtype=torch.int64, device="cpu")
 
     def _simulate(self) -> Simulations:
         """Make the simulations of the current designs."""
+        drawn = mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / self.ASSET))
+        give_floor(drawn)
         return Simulations(
-            mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / self.ASSET)),
+            drawn,
             shape_body=self.shape_body,
             designs=self._design.numpy(),
             num_threads=self._num_threads,
@@ -75,6 +91,35 @@ class Fleet:
             design: scale factors within the bounds, ``[D]`` float64.
         """
 
+    @classmethod
+    def design_names(cls) -> tuple[str, ...]:
+        """Return names of the D entries of a design: ``DESIGN_NAMES``, or by default ``design 0, design 1, ...``.
+
+        Raises:
+            ValueError: if they are not D different names of letters, digits and single spaces between words.
+        """
+        if not cls.DESIGN_NAMES:
+            return tuple(f"design {i}" for i in range(cls.DESIGN_SIZE))
+        names = tuple(cls.DESIGN_NAMES)
+        plain = all(isinstance(name, str) and re.fullmatch(r"[^\W_]+( [^\W_]+)*", name) for name in names)
+        if not plain or len(set(names)) != len(names) or len(names) != cls.DESIGN_SIZE:
+            raise ValueError(
+                f"{cls.__name__}.DESIGN_NAMES is {names}, not {cls.DESIGN_SIZE} different names of letters, digits and "
+                "single spaces, one for each entry of the design; leave it out to count them"
+            )
+        return names
+
+    @classmethod
+    def design_bounds(cls) -> tuple[Tensor, Tensor]:
+        """Return the lowest and the highest factor of each entry of a design, ``[D]`` float64 on the CPU."""
+        bounds = torch.tensor(cls.DESIGN_BOUNDS, dtype=torch.float64, device="cpu").expand(cls.DESIGN_SIZE, 2)
+        return bounds[:, 0], bounds[:, 1]
+
+    @property
+    def _first_position(self) -> int:
+        """Index of the first observed entry of qpos."""
+        return 0 if self._observes_place else self.root.unseen
+
     def clearance(self, observation: Tensor, design: Tensor) -> Tensor:
         """Height in m of a body's lowest point above the floor, negative below it; differentiable in both arguments.
 
@@ -84,6 +129,10 @@ class Fleet:
 
         Returns:
             ``[*B, 1]``, equal to MuJoCo's geometry up to the precision of the observation.
+
+        Raises:
+            ValueError: if nothing moves the body up and down, as on a fixed base, or it has lengths or shapes whose
+                lowest point is not known.
 
         Example:
             >>> from coim import HopperMorph
@@ -130,7 +179,7 @@ class Fleet:
     def _kinematics(self) -> Kinematics:
         bodies = self.simulations
         return Kinematics(
-            lambda design: bodies.body(design).compile(), bounds=self.DESIGN_BOUNDS, size=self.DESIGN_SIZE
+            lambda design: bodies.body(design).compile(), bounds=self.design_bounds(), size=self.DESIGN_SIZE
         )
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -143,7 +192,7 @@ class Fleet:
         """Step the fleet on tensors, without a reward.
 
         Args:
-            action: motor torques as shares of the motors' strength, ``[K, A]``; MuJoCo clips them to [-1, 1].
+            action: ``[K, A]``; -1 and 1 are the ends of each motor's ``ctrlrange``, to which MuJoCo clips.
 
         Returns:
             Next observation ``[K, S]`` and whether the simulation broke ``[K, 1]``, on the action's device. If the
@@ -160,6 +209,9 @@ class Fleet:
         torques = action.numpy()
         if not math.isfinite(torques.sum()):
             raise ValueError(f"action {action.tolist()} is not finite; the policy that gave it has diverged")
+        if self._range is not None:
+            middle, reach = self._range
+            torques = middle + reach * torques
         self.simulations.ctrl[:] = torques
         broken = self.simulations.step(self.FRAME_SKIP)
         observation = self._see()
@@ -176,7 +228,7 @@ class Fleet:
         """Set the state and the body of each simulation, to compare a learnt model with the simulator.
 
         Args:
-            observation: ``[K, S]``; if it does not have the root's x, that becomes 0.
+            observation: ``[K, S]``; what it does not have of the robot's place on the ground becomes 0.
             design: ``[K, D]``.
 
         Raises:
@@ -196,7 +248,7 @@ class Fleet:
         self.simulations.start(rows)
         qpos, qvel = self.simulations.qpos, self.simulations.qvel
         num_positions = qpos.shape[1] - self._first_position
-        qpos[:, ROOT_X] = 0.0
+        qpos[:, : self._first_position] = 0.0
         qpos[:, self._first_position :] = state[:, :num_positions]
         qvel[:] = state[:, num_positions:]
         self._step_count.zero_()
@@ -257,7 +309,11 @@ class Fleet:
         )
 
     def capsules(self, run: int = 0) -> Tensor:
-        """Return the current outline of one row, ``[segments, 5]``: x and z of both ends and the radius, in m."""
+        """Return the outline of one row's capsules and spheres from the side, as it stands now.
+
+        Returns:
+            ``[segments, 5]``: x and z of both ends and the radius, in m.
+        """
         return torch.from_numpy(self.simulations.capsules(run))
 
     def render(self, run: int = 0, *, width: int = 480, height: int = 360) -> np.ndarray:
@@ -271,7 +327,8 @@ class Fleet:
 
     def camera(self, run: int = 0, *, width: int = 480, height: int = 360) -> Camera:
         """Return a camera for many pictures of one row's current body, in any pose ``qpos``; see :meth:`render`."""
-        return Camera(self.simulations.body(self._design[run].numpy()), width=width, height=height)
+        body = self.simulations.body(self._design[run].numpy())
+        return Camera(body, width=width, height=height, name=self.CAMERA, root=self.root)
 
     @property
     def step_seconds(self) -> float:
@@ -289,10 +346,13 @@ class Fleet:
         if design.shape != self._design.shape:
             raise ValueError(f"design has shape {list(design.shape)}, this fleet takes {list(self._design.shape)}")
         wanted = design.detach().to("cpu", torch.float32)[rows]
-        low, high = torch.tensor(self.DESIGN_BOUNDS, dtype=torch.float32, device="cpu")
-        if not bool(((wanted >= low) & (wanted <= high)).all()):  # NaN is neither
+        low, high = (bound.float() for bound in self.design_bounds())
+        outside = ~((wanted >= low) & (wanted <= high))  # NaN is neither
+        if outside.any():
+            entry = int(outside.nonzero()[0, -1])
             raise ValueError(
-                f"design {wanted.tolist()} leaves [{low:.4g}, {high:.4g}]; clip it with design_spec.project()"
+                f"design {wanted.tolist()} with its {self.design_names()[entry]} leaves "
+                f"[{low[entry]:.4g}, {high[entry]:.4g}]; clip it with design_spec.project()"
             )
         changed = (wanted != self._design[rows]).any(-1).numpy()
         if changed.any():
@@ -309,13 +369,17 @@ class Fleet:
             )
             simulations.qpos[row] += self.reset_noise * positions.numpy()
             simulations.qvel[row] += self.reset_noise * velocities.numpy()
+            if (at := self.root.quaternion) is not None:
+                simulations.qpos[row, at : at + 4] /= np.linalg.norm(simulations.qpos[row, at : at + 4])
             simulations.lift_out_of_floor(row)
         self._step_count[rows] = 0
         self._observation[rows] = self._see()[rows]
 
     def _see(self) -> Tensor:
-        """Return the current observation ``[K, S]``: ``qpos, qvel`` with the pitch wrapped."""
-        state = np.concatenate((self.simulations.qpos[:, self._first_position :], self.simulations.qvel), axis=1)
-        pitch = state[:, PITCH - self._first_position]
-        pitch -= math.tau * np.ceil(pitch / math.tau - 0.5)  # wrap_angle, before precision is lost to float32
+        """Return the current observation ``[K, S]``: ``qpos, qvel`` with angles wrapped."""
+        first = self._first_position
+        state = np.concatenate((self.simulations.qpos[:, first:], self.simulations.qvel), axis=1)
+        for entry in self.root.angles:
+            angle = state[:, entry - first]
+            angle -= math.tau * np.ceil(angle / math.tau - 0.5)  # wrap_angle, before precision is lost to float32
         return torch.from_numpy(state.astype(np.float32))

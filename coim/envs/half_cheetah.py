@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coim.envs.fleet import uniform_and_normal
 from coim.envs.morph import MorphEnv
 from coim.envs.task import Task, speed_along
 
@@ -135,8 +136,7 @@ class HalfCheetahMorph(MorphEnv):
 
     def draw_noise(self, num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw one row's noise for ``reset_noise=1``: uniform positions, normal velocities, as in Gymnasium."""
-        positions = 2 * torch.rand(num_positions, generator=generator, dtype=torch.float64, device="cpu") - 1
-        return positions, torch.randn(num_velocities, generator=generator, dtype=torch.float64, device="cpu")
+        return uniform_and_normal(num_positions, num_velocities, generator)
 
     @staticmethod
     def reward(

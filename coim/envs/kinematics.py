@@ -20,11 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coim.envs.root import BOX, CAPSULE, CYLINDER, ELLIPSOID, FREE, HINGE, SLIDE, SPHERE, colliding, find_height
+
 UP = 2  # axis of the world that points away from the floor
 EXACT = 1e-9  # m: largest allowed error of the affine function of a table
 CHECKED = 16  # number of random designs, and of corners of the design space, on which the tables are checked
-SPHERE, CAPSULE, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SPHERE", "CAPSULE", "BOX"))
-FREE, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "SLIDE", "HINGE"))
+SHAPES = (SPHERE, CAPSULE, CYLINDER, BOX, ELLIPSOID)
 
 
 class Kinematics:
@@ -34,7 +35,7 @@ class Kinematics:
         compiled: compiles the body of a design ``[D]`` float64.
 
     Keyword Args:
-        bounds: lowest and highest entry of a design.
+        bounds: lowest and highest design, ``[D]`` each, or numbers for all entries.
         size: D.
 
     Attributes:
@@ -52,13 +53,18 @@ class Kinematics:
     """
 
     def __init__(
-        self, compiled: Callable[[np.ndarray], mujoco.MjModel], *, bounds: tuple[float, float], size: int
+        self,
+        compiled: Callable[[np.ndarray], mujoco.MjModel],
+        *,
+        bounds: tuple[Tensor, Tensor] | tuple[float, float],
+        size: int,
     ) -> None:
-        low, high = bounds
-        middle, reach = np.full(size, (low + high) / 2), (high - low) / 4
+        low, high = (np.broadcast_to(np.asarray(bound), size) for bound in bounds)
+        middle, reach = (low + high) / 2, (high - low) / 4
         rng = np.random.default_rng(0)
-        others = (rng.uniform(low, high, (CHECKED, size)), rng.choice([low, high], (CHECKED, size)))
-        self._designs = np.concatenate([middle[None], middle + reach * np.eye(size), *others])
+        corners = np.where(rng.integers(0, 2, (CHECKED, size)), high, low)
+        others = (rng.uniform(low, high, (CHECKED, size)), corners)
+        self._designs = np.concatenate([middle[None], middle + np.diag(reach), *others])
         models = [compiled(design) for design in self._designs]
         self._read_tree(models[0])
         self._affine: dict[str, tuple[Tensor, Tensor]] = {}
@@ -136,6 +142,10 @@ class Kinematics:
             return size[..., 0]
         if kind == CAPSULE:
             return size[..., 0] + size[..., 1] * seen[..., 2].abs()
+        if kind == CYLINDER:
+            return size[..., 0] * seen[..., :2].norm(dim=-1) + size[..., 1] * seen[..., 2].abs()
+        if kind == ELLIPSOID:
+            return (size * seen).norm(dim=-1)
         return (size * seen.abs()).sum(-1)
 
     def _read_tree(self, model: mujoco.MjModel) -> None:
@@ -144,25 +154,27 @@ class Kinematics:
         self._parents = [int(parent) for parent in model.body_parentid]
         self._joints = [range(start, start + number) for start, number in zip(model.body_jntadr, model.body_jntnum)]
         self._body_turn = _turns(model.body_quat)
-        self._geoms = np.flatnonzero(model.geom_bodyid > 0)
+        self._geoms = colliding(model)
         self._geom_body = [int(body) for body in model.geom_bodyid[self._geoms]]
         self._geom_type = [int(kind) for kind in model.geom_type[self._geoms]]
         self._geom_turn = _turns(model.geom_quat[self._geoms])
-        strange = {mujoco.mjtGeom(kind).name for kind in self._geom_type} - {
-            "mjGEOM_SPHERE",
-            "mjGEOM_CAPSULE",
-            "mjGEOM_BOX",
-        }
+        strange = {mujoco.mjtGeom(kind).name for kind in self._geom_type if kind not in SHAPES}
         strange |= {mujoco.mjtJoint(int(kind)).name for kind in model.jnt_type if kind not in (FREE, SLIDE, HINGE)}
         if strange:
             raise ValueError(
-                f"the body has {sorted(strange)}; only hinges, slides, spheres, capsules and boxes are known"
+                f"the body has {sorted(strange)}; only hinges, slides, spheres, capsules, cylinders, boxes and "
+                "ellipsoids are known"
             )
         roots = [body for body, parent in enumerate(self._parents) if body and not parent]
         if len(roots) != 1:
             raise ValueError(f"the file has {len(roots)} bodies without a parent; a robot has one root")
         self.num_positions = model.nq
-        self._root, self.height = roots[0], self._find_height(model)
+        height = find_height(model)
+        if height is None:
+            raise ValueError(
+                "nothing moves this body up and down: its root has neither a free joint nor a vertical slide"
+            )
+        self._root, self.height = roots[0], height
         self._positions_at_start = torch.from_numpy(model.qpos0.copy())
 
     def _tables(self, model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -172,16 +184,6 @@ class Kinematics:
         jnt_pos[model.jnt_type != HINGE] = 0.0
         geom_pos, geom_size = model.geom_pos[self._geoms], model.geom_size[self._geoms]
         return {"body_pos": body_pos, "jnt_pos": jnt_pos, "geom_pos": geom_pos, "geom_size": geom_size}
-
-    @staticmethod
-    def _find_height(model: mujoco.MjModel) -> int:
-        for joint in range(model.njnt):
-            at, of_root = int(model.jnt_qposadr[joint]), model.body_parentid[model.jnt_bodyid[joint]] == 0
-            if of_root and model.jnt_type[joint] == FREE:
-                return at + UP
-            if of_root and model.jnt_type[joint] == SLIDE and np.allclose(model.jnt_axis[joint], np.eye(3)[UP]):
-                return at
-        raise ValueError("nothing moves this body up and down: its root has neither a free joint nor a vertical slide")
 
     def _fit_start(self, models: list[mujoco.MjModel]) -> None:
         """Fit the height of the root at position 0, or, if it is not affine, the clearance at the start."""
@@ -215,7 +217,8 @@ class Kinematics:
 def _affine_fit(designs: np.ndarray, values: np.ndarray) -> tuple[tuple[Tensor, Tensor], float]:
     """Constant ``[...]`` and slope ``[D, ...]`` from the first D + 1 designs, and the largest error on all of them."""
     size = designs.shape[1]
-    slope = (values[1 : size + 1] - values[0]) / (designs[1, 0] - designs[0, 0])
+    steps = np.diagonal(designs[1 : size + 1] - designs[0]).reshape(-1, *[1] * (values.ndim - 1))
+    slope = (values[1 : size + 1] - values[0]) / steps
     constant = values[0] - np.tensordot(designs[0], slope, 1)
     error = np.abs(values - constant - np.tensordot(designs, slope, 1)).max()
     return (torch.from_numpy(constant), torch.from_numpy(slope)), float(error)

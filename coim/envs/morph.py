@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import math
-import re
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +24,6 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step, idle_rows, leave_idle
 from coim.envs.fleet import Fleet
-from coim.envs.simulation import PITCH
 from coim.envs.task import Task, speed_along
 
 DONE_KEYS = ("done", "terminated", "truncated")
@@ -34,8 +32,9 @@ DONE_KEYS = ("done", "terminated", "truncated")
 class MorphEnv(Fleet, DesignedEnv):
     """A fleet of robots; a design vector sets their bodies at reset.
 
-    A new body is a subclass: an XML file of a planar runner (see `coim.envs.planar`), the constants of
-    :class:`~coim.envs.fleet.Fleet`, :meth:`shape_body` (which lengths scale) and :meth:`reward`.
+    A new body is a subclass: an XML file, the constants of :class:`~coim.envs.fleet.Fleet`, :meth:`shape_body` (which
+    lengths scale) and :meth:`reward`. The robot runs in the plane of x and z, moves freely, or stands on a fixed base
+    (see `coim.envs.root`); its actuators are motors, and an action of -1 or 1 is an end of a motor's ``ctrlrange``.
 
     The input of a reset sets the design: ``env.reset(TensorDict({"design": xi}, [K]))``. It stays until a reset gives
     another one: auto-resets, partial resets and resets without ``design`` keep it. The first body has xi = 1. Only a
@@ -50,8 +49,10 @@ class MorphEnv(Fleet, DesignedEnv):
     observation, ``num_broken`` counts it, and its robot stays at its start until the row is reset. Other rows are not
     affected.
 
-    The pitch is wrapped to (-pi, pi], in observations and rewards: its hinge has no limits, and a fallen robot can roll
-    over. Velocities are not clipped; Gymnasium's walker and hopper clip them at 10.
+    An observation is ``qpos, qvel`` without the robot's place on the ground. Hinges without limits are wrapped to
+    (-pi, pi], such as the pitch of a planar robot: a fallen one can roll over. A free root has its orientation as
+    MuJoCo's unit quaternion (w, x, y, z), whose sign is not fixed: it changes continuously, while a fixed sign would
+    jump where robots lie on their backs. Velocities are not clipped; Gymnasium's walker and hopper clip them at 10.
 
     Keyword Args:
         num_runs: rows K of the fleet, the environment's batch size ``[K]``.
@@ -69,7 +70,8 @@ class MorphEnv(Fleet, DesignedEnv):
 
     Raises:
         ValueError: if an argument is out of range, the device does not exist, the names or bounds of the design or the
-            scale of the observation do not fit, the body is not a planar runner, or the reward is not ``[*B, 1]``.
+            scale of the observation do not fit, the body is none that `coim.envs.root` knows, or the reward is not
+            ``[*B, 1]``.
     """
 
     def __init__(
@@ -87,6 +89,7 @@ class MorphEnv(Fleet, DesignedEnv):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} {count!r} is not a whole number of at least 1")
         self.design_names()
+        self._check_bounds()
         speed_along(task, torch.zeros(1, device="cpu"))
         self.task, self.episode_steps = task, episode_steps
         self.reset_noise = self.RESET_NOISE if reset_noise is None else reset_noise
@@ -118,24 +121,6 @@ class MorphEnv(Fleet, DesignedEnv):
             ``[*B, 1]``.
         """
 
-    @classmethod
-    def design_names(cls) -> tuple[str, ...]:
-        """Return names of the D entries of a design: ``DESIGN_NAMES``, or by default ``design 0, design 1, ...``.
-
-        Raises:
-            ValueError: if they are not D different names of letters, digits and single spaces between words.
-        """
-        if not cls.DESIGN_NAMES:
-            return tuple(f"design {i}" for i in range(cls.DESIGN_SIZE))
-        names = tuple(cls.DESIGN_NAMES)
-        plain = all(isinstance(name, str) and re.fullmatch(r"[^\W_]+( [^\W_]+)*", name) for name in names)
-        if not plain or len(set(names)) != len(names) or len(names) != cls.DESIGN_SIZE:
-            raise ValueError(
-                f"{cls.__name__}.DESIGN_NAMES is {names}, not {cls.DESIGN_SIZE} different names of letters, digits and "
-                "single spaces, one for each entry of the design; leave it out to count them"
-            )
-        return names
-
     @property
     def reward_fn(self) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
         """:meth:`reward` of this environment's task, for the dream: (observation, action, next observation, design)."""
@@ -144,20 +129,25 @@ class MorphEnv(Fleet, DesignedEnv):
     @property
     def design_spec(self) -> Bounded:
         """The designs that can be built, ``[D]``: ``project`` clips to them, ``rand`` draws from them."""
-        low, high = self.DESIGN_BOUNDS
+        low, high = (bound.to(self.device, torch.float32) for bound in self.design_bounds())
         return Bounded(low, high, shape=(self.DESIGN_SIZE,), dtype=torch.float32, device=self.device)
 
     @property
     def observation_scale(self) -> Tensor:
         """Typical spread of each observation, ``[S]``; networks divide by it."""
-        # The last entries: without root x if it is not observed.
+        # The last entries: without the place on the ground if it is not observed.
         scale = self.OBSERVATION_SCALE[-self.observation_spec["observation"].shape[-1] :]
         return torch.tensor(scale, dtype=torch.float32, device=self.device)
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
         """Indices of the observation's entries that are angles, wrapped to (-pi, pi]."""
-        return (PITCH - self._first_position,)
+        return tuple(entry - self._first_position for entry in self.root.angles)
+
+    @property
+    def quaternion_index(self) -> int | None:
+        """Index of the first of the four entries of the observation that are a unit quaternion; None without one."""
+        return None if self.root.quaternion is None else self.root.quaternion - self._first_position
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Step the fleet with tensors: like :meth:`step`, without tensordicts, and many times faster for few rows.
@@ -165,7 +155,7 @@ class MorphEnv(Fleet, DesignedEnv):
         :meth:`move` does the same without the reward; :meth:`reward` computes those of a whole episode at once.
 
         Args:
-            action: motor torques as shares of the motors' strength, ``[K, A]``; MuJoCo clips them to [-1, 1].
+            action: ``[K, A]``; -1 and 1 are the ends of each motor's ``ctrlrange``, to which MuJoCo clips.
 
         Returns:
             Next observation ``[K, S]``, reward ``[K, 1]`` and whether the simulation broke ``[K, 1]``, on the action's
@@ -256,15 +246,22 @@ class MorphEnv(Fleet, DesignedEnv):
     def _on_host(self) -> bool:
         return self.device is None or self.device.type == "cpu"
 
-    def _check_numbers(self) -> None:
-        """Refuse design bounds, a frame skip, an observation scale or a reward that do not fit the body."""
-        name, size, scale = type(self).__name__, self._observation.shape[-1], self.OBSERVATION_SCALE
-        low, high = self.DESIGN_BOUNDS
-        if not (0 < low <= 1 <= high < math.inf and low < high):
+    def _check_bounds(self) -> None:
+        """Refuse bounds that are not factors of lengths."""
+        try:
+            pairs = list(zip(*(bound.tolist() for bound in self.design_bounds()), strict=True))
+        except (RuntimeError, ValueError, TypeError):
+            pairs = []
+        if not pairs or not all(0 < low <= 1 <= high < math.inf and low < high for low, high in pairs):
             raise ValueError(
-                f"{name}.DESIGN_BOUNDS is {self.DESIGN_BOUNDS}; they are factors of lengths, low < high, with 1 "
-                "between them: the body as drawn, which is the first"
+                f"{type(self).__name__}.DESIGN_BOUNDS is {self.DESIGN_BOUNDS}; it is one pair of factors of lengths, "
+                f"or {self.DESIGN_SIZE} such pairs, each low < high, with 1 between them: the body as drawn, which is "
+                "the first"
             )
+
+    def _check_numbers(self) -> None:
+        """Refuse a frame skip, an observation scale or a reward that do not fit the body."""
+        name, size, scale = type(self).__name__, self._observation.shape[-1], self.OBSERVATION_SCALE
         if not isinstance(self.FRAME_SKIP, int) or self.FRAME_SKIP < 1:
             raise ValueError(f"{name}.FRAME_SKIP is {self.FRAME_SKIP}, not a whole number of at least 1")
         if len(scale) not in (size, size + self._first_position) or not all(0 < entry < math.inf for entry in scale):

@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-ROOT_X, ROOT_Z, PITCH = 0, 1, 2  # qpos of the root: two slides in m and a hinge in rad
+from coim.envs.root import BOX, CAPSULE, CYLINDER, ELLIPSOID, SPHERE, colliding, find_height
+
 BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: far beyond any working body; MuJoCo itself warns only from 1e10 on
 
 
@@ -58,6 +59,7 @@ class Simulations:
         moving = mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL
         self._moving = self.state[:, : mujoco.mj_stateSize(self._models[0], int(moving))]
         self._scratch = mujoco.MjData(self._models[0])
+        self._height = find_height(self._models[0])
         self._silence = mujoco.MjLogConfig.get()
         self._silence.logto_file = self._silence.logto_console = False
 
@@ -108,21 +110,33 @@ class Simulations:
         return failed
 
     def lift_out_of_floor(self, row: int) -> None:
-        """Lift a robot onto the floor if one of its parts is below it."""
-        capsules = self.capsules(row)
-        lowest = (np.minimum(capsules[:, 1], capsules[:, 3]) - capsules[:, 4]).min()
-        if lowest < 0:
-            self.qpos[row, ROOT_Z] -= lowest  # rootz is a vertical slide
+        """Lift a robot onto the floor if one of its parts is below it; one on a fixed base stays."""
+        if self._height is not None and (lowest := self.lowest_point(row)) < 0:
+            self.qpos[row, self._height] -= lowest
+
+    def lowest_point(self, row: int) -> float:
+        """Return the height in m of the lowest point of a robot, of the parts that can touch something."""
+        model, data = self._posed(row)
+        return lowest_point(model, data)
 
     def capsules(self, row: int) -> np.ndarray:
-        """Return the positions of the segments: x and z of both ends and the radius in m, ``[segments, 5]``."""
-        model, data = self._models[row], self._scratch
-        data.qpos[:] = self.qpos[row]
-        mujoco.mj_kinematics(model, data)
-        shown = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+        """Return the robot's capsules and spheres as they are seen from the side.
+
+        Returns:
+            x and z of both ends and the radius in m, ``[segments, 5]``; the ends of a sphere are its centre.
+        """
+        model, data = self._posed(row)
+        shown = (model.geom_type == CAPSULE) | (model.geom_type == SPHERE)
         centre, axis = data.geom_xpos[shown][:, [0, 2]], data.geom_xmat[shown][:, [2, 8]]
         radius, half = model.geom_size[shown, :1], model.geom_size[shown, 1:2]
         return np.hstack([centre - half * axis, centre + half * axis, radius])
+
+    def _posed(self, row: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return the body of a row, and its frames in its present pose."""
+        model, data = self._models[row], self._scratch
+        data.qpos[:] = self.qpos[row]
+        mujoco.mj_kinematics(model, data)
+        return model, data
 
     def _step_silently(self, num_steps: int) -> np.ndarray:
         """Step without writing MUJOCO_LOG.TXT to the user's folder; :meth:`step` returns the broken rows instead."""
@@ -143,3 +157,29 @@ class Simulations:
         rows = np.flatnonzero(broken)
         self.start(rows)
         return rows
+
+
+def lowest_point(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Return the height in m of a robot's lowest point above z = 0, of the parts that can touch something.
+
+    Args:
+        model: the body; its parts are spheres, capsules, cylinders, boxes and ellipsoids.
+        data: its frames, as ``mj_kinematics`` leaves them.
+    """
+    parts = colliding(model)
+    kind, size = model.geom_type[parts], model.geom_size[parts]
+    height, up = data.geom_xpos[parts, 2], np.abs(data.geom_xmat[parts, 6:])  # "up" in the axes of each part
+    radius, half, slope = size[:, 0], size[:, 1], up[:, 2]
+    end = height - half * slope
+    lowest = np.select(
+        [kind == SPHERE, kind == CAPSULE, kind == CYLINDER, kind == BOX, kind == ELLIPSOID],
+        [
+            height - radius,
+            end - radius,
+            end - radius * np.sqrt(np.maximum(1 - slope**2, 0)),
+            height - (size * up).sum(1),
+            height - np.sqrt(((size * up) ** 2).sum(1)),
+        ],
+        default=np.nan,
+    )
+    return float(lowest.min())

@@ -100,7 +100,7 @@ class WalkerMorph(MorphEnv):
         device: torch.device | str | None = None,
         observe_root_x: bool = True,
     ) -> None:
-        self._first_position = 0 if observe_root_x else 1
+        self._observes_place = observe_root_x
         super().__init__(
             num_runs=num_runs,
             task=task,

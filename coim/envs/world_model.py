@@ -105,6 +105,7 @@ class WorldModelEnv(DesignedEnv):
         self.design_spec: Bounded = env.design_spec
         self.observation_scale: Tensor | None = getattr(env, "observation_scale", None)
         self.angle_indices: tuple[int, ...] = getattr(env, "angle_indices", ())
+        self.quaternion_index: int | None = getattr(env, "quaternion_index", None)
         self.clearance: Callable[..., Tensor] | None = getattr(env, "clearance", None)
         self.transfer: Callable[..., Tensor] | None = getattr(env, "transfer", None)
         self._make_specs(env)
@@ -136,7 +137,7 @@ class WorldModelEnv(DesignedEnv):
             Next observation ``[*B, S]`` and reward ``[*B, 1]``.
         """
         rng = self.rng if generator is None else generator
-        next_observation = self.ensemble.sample(observation, action, design, generator=rng)
+        next_observation = self._oriented(self.ensemble.sample(observation, action, design, generator=rng))
         return next_observation, self.reward_fn(observation, action, next_observation, design)
 
     def advance_beside(
@@ -161,8 +162,9 @@ class WorldModelEnv(DesignedEnv):
             generator: generator of the random numbers; None takes the dream's own.
 
         Returns:
-            Next observation ``[*B, S]`` with its angles in (-pi, pi], and reward ``[*B, 1]``. If nothing differs from
-            the real transition, the result is its next observation to the last bit.
+            Next observation ``[*B, S]`` with its angles in (-pi, pi] and its quaternion of length 1, and reward
+            ``[*B, 1]``. If nothing differs from the real transition, the result is its next observation to the last
+            bit; a quaternion, up to the rounding of its length.
 
         Raises:
             TypeError: if the model has no ``means``.
@@ -183,7 +185,19 @@ class WorldModelEnv(DesignedEnv):
         next_observation = real["next", "observation"] + (there - expected)
         angles = list(self.angle_indices)
         next_observation[..., angles] = wrap_angle(next_observation[..., angles])
+        next_observation = self._oriented(next_observation)
         return next_observation, self.reward_fn(observation, action, next_observation, design)
+
+    def _oriented(self, observation: Tensor) -> Tensor:
+        """Scale the quaternion of observations ``[*B, S]`` to length 1.
+
+        A model predicts the change of each entry by itself, so that a predicted orientation is none, by a little. Over
+        a few steps that would add up.
+        """
+        if (at := self.quaternion_index) is None:
+            return observation
+        turned = torch.nn.functional.normalize(observation[..., at : at + 4], dim=-1)
+        return torch.cat([observation[..., :at], turned, observation[..., at + 4 :]], -1)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step the ``observation`` and ``design`` of the input; the dream's own ones if they are missing."""

@@ -73,8 +73,8 @@ def total_mass(env: MorphEnv) -> float:
 
 def corners_and_random(body: type[MorphEnv], num_random: int) -> Tensor:
     """All corners of the design space and some uniform designs, ``[P, D]``."""
-    corners = torch.tensor(list(itertools.product(body.DESIGN_BOUNDS, repeat=body.DESIGN_SIZE)))
-    low, high = body.DESIGN_BOUNDS
+    low, high = (bound.float() for bound in body.design_bounds())
+    corners = torch.tensor(list(itertools.product(*zip(low.tolist(), high.tolist()))))
     generator = torch.Generator().manual_seed(0)
     return torch.cat([corners, low + (high - low) * torch.rand(num_random, body.DESIGN_SIZE, generator=generator)])
 

@@ -17,7 +17,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDict
 
-from coim.envs import BODIES
+from coim.envs import BODIES, MorphEnv
 from coim.envs.camera import Camera
 from coim.episode import run_episode
 from coim.experiments.run.atomic_write import naming_out, written_aside
@@ -47,7 +47,7 @@ class Take:
         entries: entries of the design, with their names.
         camera: camera in front of its body.
         poses: joint positions before each step and after the last, ``[T + 1, nq]``.
-        speed: along x in m/s, ``[T + 1]``.
+        speed: along x in m/s, ``[T + 1]``; 0 on a fixed base.
         returned: rewards so far, ``[T + 1]``.
         step_seconds: simulated time of a step, s.
     """
@@ -205,11 +205,11 @@ def take(loaded: SavedRun, tried: TriedDesign, policy: PolicyName, width: int, h
     bodies.set_simulation_state(start)
     bodies.reset(TensorDict({"design": design}, bodies.batch_size))
     simulations = bodies.simulations
-    poses, speed, rewards = [simulations.qpos[row].copy()], [float(simulations.qvel[row, 0])], [0.0]
+    poses, speed, rewards = [simulations.qpos[row].copy()], [speed_of(bodies, row)], [0.0]
     for action in actions:
         _, reward, broken = bodies.advance(action)
         poses.append(simulations.qpos[row].copy())
-        speed.append(float(simulations.qvel[row, 0]))
+        speed.append(speed_of(bodies, row))
         rewards.append(float(reward[row]))
         if broken.any():
             bodies.reset(TensorDict({"_reset": broken}, bodies.batch_size))
@@ -223,6 +223,11 @@ def take(loaded: SavedRun, tried: TriedDesign, policy: PolicyName, width: int, h
         returned=np.cumsum(rewards),
         step_seconds=bodies.step_seconds,
     )
+
+
+def speed_of(bodies: MorphEnv, row: int) -> float:
+    """Speed of a robot along x in m/s; 0 on a fixed base."""
+    return float(bodies.simulations.qvel[row, 0]) if bodies.root.unseen else 0.0
 
 
 def write_film(path: Path, takes: Sequence[Take]) -> None:

@@ -49,19 +49,19 @@ def principal_directions(designs: Tensor) -> tuple[Tensor, Tensor]:
     return (directions[:2] * largest.sign() + 0.0).float(), (sizes.square() / sizes.square().sum())[:2].float()
 
 
-def plane(origin: Tensor, directions: Tensor, bounds: tuple[float, float], *, side: int = SIDE) -> Tensor:
+def plane(origin: Tensor, directions: Tensor, bounds: tuple[Tensor, Tensor], *, side: int = SIDE) -> Tensor:
     """A grid of coordinates over the part of a plane in which designs are within their bounds.
 
     Args:
         origin: a design of the plane, ``[D]``.
         directions: two unit vectors, ``[2, D]``.
-        bounds: of every entry of a design.
+        bounds: lowest and highest design, ``[D]`` each.
         side: points along each direction.
 
     Returns:
         ``[side**2, 2]`` coordinates; those of designs that leave the bounds are among them.
     """
-    corners = torch.tensor(list(itertools.product(bounds, repeat=len(origin))))
+    corners = torch.tensor(list(itertools.product(*zip(*(bound.tolist() for bound in bounds)))))
     reach = (corners - origin) @ directions.T
     inside = reach.new_zeros(1, 2)
     for _ in range(2):  # first in all of the box's shadow, then in that of the plane's own part
@@ -72,7 +72,7 @@ def plane(origin: Tensor, directions: Tensor, bounds: tuple[float, float], *, si
     return grid
 
 
-def with_area(designs: Tensor, directions: Tensor, bounds: tuple[float, float]) -> Tensor:
+def with_area(designs: Tensor, directions: Tensor, bounds: tuple[Tensor, Tensor]) -> Tensor:
     """Designs through which enough of the plane can be built to be looked at.
 
     Through a corner of the bounds a plane may go that meets them nowhere else: nothing but the corner can be built.
@@ -80,14 +80,14 @@ def with_area(designs: Tensor, directions: Tensor, bounds: tuple[float, float]) 
     Args:
         designs: ``[N, D]``.
         directions: two unit vectors, ``[2, D]``.
-        bounds: of every entry of a design.
+        bounds: lowest and highest design, ``[D]`` each.
 
     Returns:
-        Whether the part within the bounds is at least `AREA` of the bounds' width squared, ``[N]`` bool.
+        Whether the part within the bounds is at least `AREA` of the bounds' mean width squared, ``[N]`` bool.
 
     Example:
         >>> askew = torch.tensor([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]) / 2**0.5
-        >>> with_area(torch.tensor([[1.0] * 4, [2.0] * 4]), askew, (0.5, 2.0))
+        >>> with_area(torch.tensor([[1.0] * 4, [2.0] * 4]), askew, (torch.full((4,), 0.5), torch.full((4,), 2.0)))
         tensor([ True, False])
     """
     different, of_design = designs.unique(dim=0, return_inverse=True)
@@ -96,10 +96,10 @@ def with_area(designs: Tensor, directions: Tensor, bounds: tuple[float, float]) 
         grid = plane(origin, directions, bounds)
         share = within(origin + grid @ directions, bounds).float().mean()
         areas.append(share * (grid.amax(0) - grid.amin(0)).prod())
-    return (torch.stack(areas) >= AREA * (bounds[1] - bounds[0]) ** 2)[of_design]
+    return (torch.stack(areas) >= AREA * (bounds[1] - bounds[0]).mean() ** 2)[of_design]
 
 
-def within(designs: Tensor, bounds: tuple[float, float]) -> Tensor:
+def within(designs: Tensor, bounds: tuple[Tensor, Tensor]) -> Tensor:
     """Which of ``[P, D]`` designs can be built."""
     return ((designs >= bounds[0]) & (designs <= bounds[1])).all(-1)
 
@@ -137,7 +137,7 @@ def design_space(
     rows: TensorDictBase,
     tried: Tensor,
     variance: Tensor,
-    bounds: tuple[float, float],
+    bounds: tuple[Tensor, Tensor],
     *,
     side: int = SIDE,
 ) -> list[dict[str, object]]:
@@ -152,7 +152,7 @@ def design_space(
         rows: transitions, ``[N]``.
         tried: all designs of the run, ``[N, D]``.
         variance: of one-step changes, ``[S]``.
-        bounds: of every entry of a design.
+        bounds: lowest and highest design, ``[D]`` each.
         side: points along each direction of the grid.
 
     Returns:

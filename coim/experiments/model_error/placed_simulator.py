@@ -80,6 +80,6 @@ class PlacedSimulator:
         return following[:count].cpu(), depth, broken[:count, 0].cpu()
 
     def _depth(self, row: int) -> Tensor:
-        capsules = self.env.capsules(row)
-        lowest = (capsules[:, [1, 3]] - capsules[:, 4:]).min()
-        return (-lowest).clamp(min=0).float()
+        moves = self.env.root.height is not None  # on a fixed base there is no floor to be in
+        lowest = self.env.simulations.lowest_point(row) if moves else 0.0
+        return torch.tensor(max(-lowest, 0.0), dtype=torch.float32, device="cpu")

@@ -116,7 +116,8 @@ def write_design_space(probed: ProbedCoAdaptation, body: type[MorphEnv], folder:
         own = learner.ensemble if learner.num_runs is None else select_run(learner.ensemble, run)
         models[predict] = deepcopy(own).cpu()
     variance = variance if variance.ndim == 1 else variance[run]
-    simulator, bounds = probed.probes.simulator, body.DESIGN_BOUNDS
+    simulator, (low, high) = probed.probes.simulator, body.design_bounds()
+    bounds = low.float(), high.float()
     try:
         shown = with_area(seen["design"][order], principal_directions(tried)[0], bounds)
         chosen = order[shown][:STATES]

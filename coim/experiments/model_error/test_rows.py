@@ -52,9 +52,9 @@ class Probes:
             for count in (num_runs, NEVER_BUILT)
         )
         self.simulator = PlacedSimulator(body, num_threads=num_threads)
-        low, high = body.DESIGN_BOUNDS
+        low, high = body.design_bounds()
         uniform = torch.rand(NEVER_BUILT, body.DESIGN_SIZE, generator=torch.Generator().manual_seed(0))
-        self.never_built = (low + (high - low) * uniform).to(device)
+        self.never_built = (low.float() + (high - low).float() * uniform).to(device)
 
     def trajectory(self, policy: Policy, design: Tensor, *, seed: int) -> TensorDict:
         """Rows ``[R, K]`` of one episode of each run's design ``[K, D]``, with sampled actions as in training."""

@@ -53,7 +53,7 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
         axes.set_title(name, loc="left", fontsize=10)
         axes.set(ylabel="scale factor (1)")
         if body is not None:
-            low, high = body.DESIGN_BOUNDS
+            low, high = (float(bound[i]) for bound in body.design_bounds())
             margin = 0.06 * (high - low)
             axes.set(ylim=(low - margin, high + margin))
             for bound in (low, high):
@@ -64,9 +64,11 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
         axes.set(xlabel="design (number)")
         axes.tick_params(labelbottom=True)
     explain(figure, records, kinds=True, more=cross_handles(records))
-    bounds = (
-        "" if body is None else f" Dashed: the bounds, {body.DESIGN_BOUNDS[0]:.3g} and {body.DESIGN_BOUNDS[1]:.3g}."
-    )
+    bounds = ""
+    if body is not None:
+        lowest, highest = (bound.unique().tolist() for bound in body.design_bounds())
+        alike = len(lowest) == len(highest) == 1
+        bounds = f" Dashed: the bounds, {lowest[0]:.3g} and {highest[0]:.3g}." if alike else " Dashed: the bounds."
     caption = f"Scale factors of the body, 1 as drawn.{bounds}"
     alt = f"Scale factors over designs: {', '.join(names)}.{bounds}"
     return Section(title="Designs over time", figure=figure, caption=caption, alt=alt)

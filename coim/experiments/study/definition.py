@@ -215,11 +215,13 @@ def refuse_unbuildable(cell: Cell) -> None:
         ValueError: with the design and what that body's designs are.
     """
     design, body = cell.settings.first_design, BODIES[cell.environment]
-    low, high = body.DESIGN_BOUNDS
-    if design and not (len(design) == body.DESIGN_SIZE and all(low <= factor <= high for factor in design)):
+    low, high = (bound.tolist() for bound in body.design_bounds())
+    fits = len(design) == body.DESIGN_SIZE and all(x <= factor <= y for x, factor, y in zip(low, design, high))
+    if design and not fits:
         raise ValueError(
-            f"first_design is {design}, a design of {cell.environment} has {body.DESIGN_SIZE} scale factors from {low} "
-            f"to {high}; write such, and one for each environment in the overrides of a block of its own"
+            f"first_design is {design}, a design of {cell.environment} has {body.DESIGN_SIZE} scale factors from "
+            f"{low[0] if len(set(low)) == 1 else low} to {high[0] if len(set(high)) == 1 else high}; write such, and "
+            "one for each environment in the overrides of a block of its own"
         )
 
 

@@ -27,7 +27,7 @@ from coim.experiments.model_error.run import probe, write_design_space
 from coim.experiments.model_error.test_rows import NEVER_BUILT, Probes, joined
 from coim.pairs import IN_THE_FLOOR
 
-BOUNDS = HopperMorph.DESIGN_BOUNDS
+BOUNDS = tuple(bound.float() for bound in HopperMorph.design_bounds())
 
 
 class Perfect:

@@ -1,4 +1,4 @@
-"""Which bodies may be a MorphEnv: planar runners, and nothing that would be simulated wrongly without a word."""
+"""How robots move, read from their files, and that nothing is simulated wrongly without a word."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from coim.envs import HopperMorph, MorphEnv
-from coim.envs.planar import check_planar
+from coim.envs.root import Root, read_root
 
 GYMNASIUM = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 HOPPER = Path(__file__).parents[2] / "coim/envs/assets/hopper.xml"
@@ -28,23 +28,25 @@ def body_of(file: str) -> type[MorphEnv]:
 
 
 @pytest.mark.parametrize(
-    ("file", "different"),
+    ("file", "root"),
     [
-        ("inverted_pendulum.xml", "has a hinge along .* as joint 1, not a slide along z"),
-        ("swimmer.xml", r"has a slide along \[0.0, 1.0, 0.0\] .*as joint 1, not a slide along z"),
-        ("ant.xml", r"has a free \(root\) as joint 0, not a slide along x"),
-        ("humanoid.xml", r"has a free \(root\) as joint 0"),
-        ("reacher.xml", "has a hinge along .* as joint 0"),
+        ("hopper.xml", Root("planar", 1, 1, None, (2,))),
+        ("walker2d.xml", Root("planar", 1, 1, None, (2,))),
+        ("half_cheetah.xml", Root("planar", 1, 1, None, (2,))),
+        ("ant.xml", Root("free", 2, 2, 3, ())),
+        ("humanoid.xml", Root("free", 2, 2, 3, ())),
+        ("inverted_pendulum.xml", Root("fixed", 0, None, None, ())),
+        ("reacher.xml", Root("fixed", 0, None, None, (0,))),  # its first joint turns for ever
     ],
 )
-def test_another_robot_is_refused_by_name_when_it_is_made(file: str, different: str) -> None:
-    with pytest.raises(ValueError, match=f"Body {different}.*a body is a planar runner: a root with a slide along x"):
-        body_of(file)()
+def test_gymnasiums_robots_are_planar_free_or_fixed(file: str, root: Root) -> None:
+    assert read_root(mujoco.MjModel.from_xml_path(str(GYMNASIUM / file)), file) == root
 
 
-@pytest.mark.parametrize("file", ["hopper.xml", "walker2d.xml", "half_cheetah.xml"])
-def test_gymnasiums_own_planar_runners_are_taken(file: str) -> None:
-    check_planar(mujoco.MjModel.from_xml_path(str(GYMNASIUM / file)), file)
+def test_another_robot_is_refused_by_name_when_it_is_made() -> None:
+    different = r"a slide along \[0.0, 1.0, 0.0\] .*as joint 1, not a slide along z"
+    with pytest.raises(ValueError, match=f"Body has {different}.*; a planar runner has a root with a slide along x"):
+        body_of("swimmer.xml")()
 
 
 @pytest.mark.parametrize(
@@ -52,28 +54,27 @@ def test_gymnasiums_own_planar_runners_are_taken(file: str) -> None:
     [
         ('axis="1 0 0" pos', 'axis="-1 0 0" pos', r"a slide along \[-1.0, 0.0, 0.0\] \(rootx\) as joint 0"),
         ('axis="0 -1 0" armature', 'axis="1 0 0" armature', r"a hinge along \[1.0, 0.0, 0.0\] \(thigh\) as joint 3"),
-        ('ctrlrange="-1 1"', 'ctrlrange="-2 2"', r"a motor, thigh, whose ctrlrange is \[-2.0, 2.0\]"),
-        ('ctrllimited="true"', 'ctrllimited="false"', "a motor, thigh, whose ctrlrange"),
+        ('ctrllimited="true"', 'ctrllimited="false"', "a motor, thigh, without a ctrlrange"),
         ('<motor name="leg" joint="leg"/>', '<position name="leg" joint="leg"/>', "an actuator, leg, that is no motor"),
-        ('geom name="leg"', 'geom name="leg" type="box"', "a segment, leg, that is no capsule"),
-        ('geom name="floor"', 'geom name="floor" pos="0 0 1"', "no plane named 'floor' at z = 0"),
-        ('geom name="floor"', 'geom name="ground"', "no plane named 'floor'"),
+        ('geom name="leg"', 'geom name="leg" type="box"', "a segment, leg, that is a box"),
+        ('geom name="floor"', 'geom name="floor" pos="0 0 1"', "no floor: no horizontal plane at z = 0"),
+        ('geom name="floor"', 'geom name="floor" zaxis="1 0 0"', "no floor: no horizontal plane"),
     ],
 )
-def test_what_is_not_a_planar_runner_is_named(drawn: str, changed: str, different: str) -> None:
+def test_what_no_body_can_have_is_named(drawn: str, changed: str, different: str) -> None:
     text = HOPPER.read_text()
     assert drawn in text
     model = mujoco.MjModel.from_xml_string(text.replace(drawn, changed).replace('size=".04 .25"', 'size=".04 .25 .04"'))
-    with pytest.raises(ValueError, match=f"Hopper has {different}.*; a body is a planar runner"):
-        check_planar(model, "Hopper")
+    with pytest.raises(ValueError, match=f"Hopper has {different}.*; (a planar runner|every actuator|add a geom)"):
+        read_root(model, "Hopper")
 
 
 def test_a_body_without_motors_is_named() -> None:
     spec = mujoco.MjSpec.from_file(str(HOPPER))
     for motor in list(spec.actuators):
         spec.delete(motor)
-    with pytest.raises(ValueError, match="Hopper has no motor; a body is"):
-        check_planar(spec.compile(), "Hopper")
+    with pytest.raises(ValueError, match="Hopper has no motor; every actuator is a motor"):
+        read_root(spec.compile(), "Hopper")
 
 
 @pytest.mark.parametrize(
