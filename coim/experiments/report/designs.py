@@ -140,10 +140,10 @@ def predictions(records: Sequence[Record]) -> Section:
     )
 
 
-def describe_correlation(rows: pd.DataFrame) -> str:
-    """A sentence on Spearman's rank correlation of prediction and best return, as a mean over runs."""
+def describe_correlation(rows: pd.DataFrame, said: str = "predicted") -> str:
+    """A sentence on Spearman's rank correlation of what was ``said`` and best return, as a mean over runs."""
     by_run = [own for _, own in rows.groupby("run")]
-    values = [value for own in by_run if math.isfinite(value := spearman(own["predicted"], own["best_return"]))]
+    values = [value for own in by_run if math.isfinite(value := spearman(own[said], own["best_return"]))]
     if not values:
         return f"rank correlation not defined (n = {len(rows)} designs)"
     counts = "/".join(str(n) for n in sorted({len(own) for own in by_run}))

@@ -26,7 +26,6 @@ from coim.experiments.report.axes import (
 )
 from coim.experiments.report.page import Section
 from coim.experiments.run.records import Record, number
-from coim.pairs import IN_THE_FLOOR
 
 LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
     "loss_actor": "actor loss (1)",
@@ -65,14 +64,14 @@ def learning_curves(records: Sequence[Record]) -> Section:
 
 
 def model_errors(records: Sequence[Record]) -> Section:
-    """How well the ensemble predicted each new episode, and which share of imagined pairs is impossible."""
+    """How well the ensemble predicted each new episode before it learnt from it."""
     title = "Model error over time"
-    figure, (axes, below) = new_figure(4.6, 2, 1, sharex=True)
+    figure, (axes,) = new_figure(3.0)
     if len(records) == 1:
         mark_builds(axes, records[0])
     if not plot_over_steps(axes, records, "model_error"):
         return Section(title=title, notes=["No model was learnt."])
-    axes.set(ylabel="squared error over\nvariance of changes (1)", yscale="log")
+    axes.set(xlabel=f"{STEPS} (1)", ylabel="squared error over\nvariance of changes (1)", yscale="log")
     low, high = axes.get_ylim()
     axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=LogLocator(subs=(3, 4, 6, 7, 8, 9)))
     axes.yaxis.set_major_formatter("{x:g}")
@@ -83,15 +82,6 @@ def model_errors(records: Sequence[Record]) -> Section:
         "Squared error of the model's means on each new episode before learning from it, in units of the variance of "
         "one-step changes. Dashed: as good as predicting that nothing changes."
     )
-    if plot_over_steps(below, records, "impossible"):
-        below.set(xlabel=f"{STEPS} (1)", ylabel="shares (1)", ylim=(-0.02, 1.02))
-        caption += f" Below: share of imagined pairs with over {100 * IN_THE_FLOOR:.0f} cm of the body in the floor."
-        if plot_over_steps(below, records, "imagined_share", faint=False, linestyle=":"):
-            caption += " Dotted: share of a batch that is imagined."
-    else:  # a run from before they were counted
-        below.set_visible(False)
-        axes.set(xlabel=f"{STEPS} (1)")
-        axes.tick_params(labelbottom=True)
     ends = [f"{r.name}: {m[0]:.3g} to {m[-1]:.3g}" for r in records if (m := _means(r, "model_error")).size]
     return Section(
         title=title,

@@ -12,7 +12,8 @@ import pandas as pd
 from coim.envs import BODIES, MorphEnv
 from coim.experiments.drawing.layout import FONT
 from coim.experiments.frames import designs_of
-from coim.experiments.report import designs, learning
+from coim.experiments.report import designs, evidence, learning
+from coim.experiments.report.imagined import imagination
 from coim.experiments.report.page import Section, Table, narrow, page
 from coim.experiments.run.atomic_write import dated_file, naming_out, write_whole
 from coim.experiments.run.records import Record, number, read_records
@@ -59,20 +60,24 @@ def place_of(out: Path | None, folders: Sequence[Path]) -> Path:
 
 
 def sections_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[Section]:
-    """All sections in the order of the page. A new section is a function and a line here."""
-    return [
+    """All sections in the order of the page. A new section is a function and a line here; None is left out."""
+    sections = [
         best_bodies(records[0]) if len(records) == 1 else comparison(records),
         designs.best_returns(records),
         learning.learning_curves(records),
         designs.designs_over_time(records, body),
         designs.bodies(records, body),
         designs.predictions(records),
+        evidence.expectations(records),
+        evidence.worth(records),
         learning.model_errors(records),
+        imagination(records),
         learning.losses(records),
         learning.times(records),
         in_full("Settings", records, [record.settings for record in records]),
         in_full("Versions and machine", records, [origin(record) for record in records]),
     ]
+    return [section for section in sections if section is not None]
 
 
 def best_bodies(record: Record) -> Section:

@@ -14,7 +14,7 @@ import pandas as pd
 from coim.envs import BODIES
 from coim.experiments.frames import design_columns_of, read_frame
 from coim.experiments.run.atomic_write import readable
-from coim.run_folder import DESIGNS, EVALUATIONS, METRICS, read_config
+from coim.run_folder import DESIGNS, EVALUATIONS, EXPECTED, METRICS, read_config
 from coim.tables import entry_of_column
 
 PLACE = ["run", "design", "episode"]
@@ -29,7 +29,8 @@ class Record:
         config: ``config.json``.
         episodes: rows of ``evaluations.csv``, each with the cells that ``metrics.csv`` has for it.
         designs: a row per run and design, also for those under way: run, design, kind, the columns of the design,
-            best_return, predicted, diverged, and finished, which is False where the run diverged.
+            best_return, predicted, expected and deviation (NaN where no posterior chose the bodies), diverged, and
+            finished, which is False where the run diverged.
         design_names: names of the D entries of a design, as the columns have them; where an older folder counts them,
             the body's.
     """
@@ -123,8 +124,9 @@ def best_of_designs(episodes: pd.DataFrame, finished: pd.DataFrame) -> pd.DataFr
     designs = episodes.groupby(["run", "design"], sort=False, as_index=False).agg(
         first | {"return": "max", "diverged": "last"}
     )
-    predicted = finished[["run", "design", "predicted"]].drop_duplicates(["run", "design"], keep="last")
-    designs = designs.merge(predicted, how="left", on=["run", "design"], indicator="finished")
+    told = finished.reindex(columns=["run", "design", "predicted", *EXPECTED])
+    told = told.drop_duplicates(["run", "design"], keep="last")
+    designs = designs.merge(told, how="left", on=["run", "design"], indicator="finished")
     designs["finished"] = (designs["finished"] == "both") & (designs["diverged"] == "")
     return designs.rename(columns={"return": "best_return"})
 
