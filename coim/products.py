@@ -145,7 +145,12 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: Activation = "no
         return affine(x.float(), weight.float(), bias.float(), activation).to(x.dtype)
     if _by_onednn(x, weight):
         return _onednn(x, weight.t(), bias, activation)
-    y = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(-2), x, weight)
+    if x.dim() == 2 and x.device.type == "cpu" and torch.compiler.is_compiling():
+        # A compiler adds the bias with the activation, in one pass. It would put a sum of two matrices back into addmm,
+        # which copies the bias into every row first; one with another dimension it leaves.
+        y = (torch.mm(x, weight).unsqueeze(0) + bias).squeeze(0)
+    else:
+        y = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(-2), x, weight)
     if activation == "none":
         return y
     return y.relu_() if activation == "relu" else torch.nn.functional.silu(y, inplace=True)
