@@ -10,6 +10,7 @@ from pathlib import Path
 from coim.experiments.figures.plot import Plot
 from coim.experiments.study.ledger import Entry, State, in_csv
 from coim.experiments.study.runs import parts_of
+from coim.run_folder import EXPECTED
 
 SETTINGS = {
     "num_designs": 4,
@@ -35,6 +36,7 @@ def write_cell(
     kinds: Sequence[str] = KINDS,
     predicted: Sequence[float | None] = (None, 1.0, 2.0, 3.0, 4.0, 5.0),
     diverged: Sequence[int] = (),
+    expected: Sequence[tuple[float, float] | None] = (),
     part: str = "cells",
     **settings: object,
 ) -> Path:
@@ -47,6 +49,7 @@ def write_cell(
         kinds: of each design.
         predicted: Q(xi) of each design.
         diverged: runs that diverged on the last design they have.
+        expected: what a posterior expected of each design, and its deviation; by default there was none.
         part: of the study's folder.
         settings: that differ from `SETTINGS`.
     """
@@ -62,9 +65,14 @@ def write_cell(
             for episode, value in enumerate((best - 1, best)):  # the best comes second
                 steps = (2 * index + episode + 1) * 10
                 episodes.append([*place, episode + 1, value, steps, 36 * (2 * index + episode + 1), last])
-            designs.append([*place, predicted[index], best, last])
+            told = list(expected[index] or (None, None)) if expected else []
+            designs.append([*place, predicted[index], best, *told, last])
     write_table(folder / "evaluations.csv", COLUMNS, episodes)
-    write_table(folder / "designs.csv", [*COLUMNS[:5], "predicted", "best_return", "diverged"], designs)
+    write_table(
+        folder / "designs.csv",
+        [*COLUMNS[:5], "predicted", "best_return", *(EXPECTED if expected else ()), "diverged"],
+        designs,
+    )
     return folder
 
 

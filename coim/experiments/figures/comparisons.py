@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,20 @@ from coim.experiments.figures.legend import point_entries
 from coim.experiments.figures.plot import Plot, missing, shown
 from coim.experiments.frames import at, rows_of
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, interval, iqm, mean
-from coim.experiments.statistics.measures import MEASURES, NUMBERS, Cells, comparisons, limits, measures, predictions
+from coim.experiments.statistics.measures import COMPARED, MEASURES, NUMBERS, Cells, comparisons, limits, measures
+from coim.experiments.statistics.predicted import predictions
+from coim.experiments.statistics.retrained import with_retrained
 from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
 LABELS = {"area": "area: mean best return\nof a design (1)", "final": "final: highest\nbest return (1)"}
 ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not."
-OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_given_order", "bias_optimised", "bias_random")
+PREDICTION = "The prediction is the return that a posterior expected where one chose the bodies, and Eq. 5 elsewhere."
+OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_raw", "coverage", "bias_optimised", "bias_random")
 INTERVALS = f"Intervals are {CONFIDENCE:.0%} percentile bootstraps over runs ({RESAMPLES} resamples)."
 AREA = "area: the mean over designs of the best return of a design. final: the highest best return of all designs."
 ARMS_SHOWN = ["environment", "task", "arm", "planned", "over", "diverged"]
-ARMS_SHOWN += ["area_iqm", "final_iqm", "search_gain", "rank_correlation_given_order"]
+ARMS_SHOWN += ["area_iqm", "final_iqm", "search_gain", "rank_correlation"]
 PAIRS_SHOWN = ["environment", "task", "measure", "arm", "against", "difference", "improvement"]
 PAIRS_SHOWN += ["welch_p_holm", "paired_p_holm", "detectable"]
 
@@ -35,7 +38,7 @@ PAIRS_SHOWN += ["welch_p_holm", "paired_p_holm", "detectable"]
 def plots(study: Path) -> Iterator[Plot]:
     """Arms, pairs of arms, predictions, runs."""
     runs = read_runs(study)
-    measured = measures(runs)
+    measured = with_retrained(measures(runs), study)
     yield arms(runs, measured)
     yield pairs(runs, measured)
     yield predicted(runs)
@@ -64,14 +67,17 @@ def arms(runs: Runs, measured: pd.DataFrame) -> Plot:
     notes = (
         AREA,
         INTERVALS,
-        "search_gain: mean best return of designs that maximised Q minus that of random designs, mean over runs.",
-        "rank_correlation: Spearman's correlation of Q(xi) before a body was built and the best return on it, over the "
-        "bodies after the first ones, mean over runs. rank_correlation_given_order: the partial correlation with the "
-        "order of building held fixed, because Q and returns both rise while the networks learn.",
-        "bias_optimised, bias_random: (1 - gamma) Q(xi) minus best return / steps, on designs that maximised Q and on "
-        f"random designs. Both terms are a reward per step, and equal if the reward is constant. {ENTROPY}",
-        "search_gain, the correlations and the biases are over the designs that a run reached; columns that end in "
-        "_runs count the runs that have a value.",
+        "search_gain: mean best return of designs that were searched for minus that of random designs, mean over runs.",
+        "rank_correlation: Spearman's correlation of the prediction before a body was built and the best return on it, "
+        "over the bodies after the first ones, with the order of building held fixed, because predictions and returns "
+        "both rise while the networks learn; mean over runs. rank_correlation_raw: the order not held fixed. "
+        f"{PREDICTION}",
+        "coverage: share of these best returns within the 90% interval of what a posterior expected.",
+        "bias_optimised, bias_random: prediction minus best return, both as reward per step, on designs that were "
+        "searched for and on random designs. Eq. 5 counts as (1 - gamma) Q(xi), a return as return / steps: equal if "
+        f"the reward is constant. {ENTROPY}",
+        "search_gain, rank_correlation, coverage and the biases are over the designs that a run reached; columns that "
+        "end in _runs count the runs that have a value.",
         "diverged_share: share of the runs that have begun. hours: wall-clock of the cell. hours and updates are means "
         "over runs.",
         runs.in_words(runs.arms, counted=True),
@@ -97,7 +103,7 @@ def summary(runs: Runs, place: Place, arm: str, own: pd.DataFrame) -> Cells:
         row |= {f"{name}_mean": float(mean(values)) if len(over) else np.nan}
         row |= {f"{name}_iqm": float(iqm(values)) if len(over) else np.nan} | limits(f"{name}_iqm", iqm, values)
     for name in OF_SEARCH:
-        values = over[name.removeprefix("rank_")].dropna().to_numpy()
+        values = over[name].dropna().to_numpy()
         row |= {name: float(mean(values)) if values.size else np.nan} | limits(name, mean, values)
         row |= {f"{name}_runs": values.size}
     for name in ("hours", "updates"):
@@ -148,24 +154,26 @@ def pairs(runs: Runs, measured: pd.DataFrame) -> Plot:
     rows = rows_of(comparisons(runs, measured))
     if not rows:
         return missing("statistics_pairs", "No two arms have runs that are over.", runs.in_words(runs.arms))
-    figure, grid = new_figure(0.9 + 0.26 * max(4, len(rows) // 2), 1, len(MEASURES))
-    for axes, name in zip(grid, MEASURES):
-        own = [row for row in rows if row["measure"] == name]
-        for y, row in enumerate(reversed(own)):
-            arm = arm_named(str(row["arm"]))
+    labels = list(dict.fromkeys(map(label_of, rows)))[::-1]  # the first on top
+    there = [name for name in COMPARED if any(row["measure"] == name for row in rows)]
+    figure, grid = new_figure(0.9 + 0.26 * max(4, len(labels)), 1, len(there))
+    for axes, name in zip(grid, there):
+        for row in (row for row in rows if row["measure"] == name):
+            arm, y = arm_named(str(row["arm"])), labels.index(label_of(row))
             axes.plot([row["improvement_low"], row["improvement_high"]], [y, y], linewidth=2, color=arm.colour)
             axes.plot(row["improvement"], y, **arm.point)
-        labels = ["{arm} over {against}\n{environment}, {task}".format(**row) for row in reversed(own)]
         axes.axvline(0.5, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-        axes.set(xlim=(-0.03, 1.03), ylim=(-0.7, len(own) - 0.3), xlabel="probability of improvement (1)")
-        axes.set(title=name, yticks=range(len(own)), yticklabels=labels if name == MEASURES[0] else [])
+        axes.set(xlim=(-0.03, 1.03), ylim=(-0.7, len(labels) - 0.3), xlabel="probability of improvement (1)")
+        axes.set(title=name, yticks=range(len(labels)), yticklabels=labels if name == there[0] else [])
         axes.tick_params(axis="y", labelsize=7)
     caption = (
-        "Probability of improvement: that a run of one arm ends above a run of the other, ties counting half, by area "
-        "and by final best return. Points: estimates. Bars: 95 % bootstrap intervals over runs. Dashed: no difference."
+        "Probability of improvement: that a run of one arm ends above a run of the other, ties counting half, by area, "
+        "final best return and retrained best body. Points: estimates. Bars: 95 % bootstrap intervals over runs. "
+        "Dashed: no difference."
     )
     notes = (
         AREA,
+        "retrained: best return of the best body of a run, trained from scratch, of the runs whose body was.",
         f"{INTERVALS} A probability of 1 means that no run of the other arm was above one of this arm; few runs often "
         "show that by chance.",
         "all: the mean over the environments and tasks in which both arms have runs, each resampled by itself.",
@@ -188,8 +196,13 @@ def pairs(runs: Runs, measured: pd.DataFrame) -> Plot:
     )
 
 
+def label_of(row: Mapping[str, Any]) -> str:
+    """What stands beside a pair of arms."""
+    return "{arm} over {against}\n{environment}, {task}".format(**row)
+
+
 def predicted(runs: Runs) -> Plot:
-    """Q(xi) before a body was built against the best return on it, both as reward per step."""
+    """The prediction before a body was built against the best return on it, both as reward per step."""
     rows: list[Cells] = []
     places = [
         place for place in runs.places if any(len(predictions(run)) for arm in runs.arms for run in runs.of(place, arm))
@@ -210,17 +223,18 @@ def predicted(runs: Runs) -> Plot:
             axes.scatter(x, y, s=12, alpha=0.6, linewidth=0, **arm_named(arm).point)
             rows += own
         axes.axline((0, 0), slope=1, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-        axes.set(xlabel=r"$(1 - \gamma)\ Q(\xi)$, reward per step (1)", ylabel="best return / steps (1)")
+        axes.set(xlabel="prediction, reward per step (1)", ylabel="best return / steps (1)")
         axes.set(title=", ".join(place))
     for axes in grid[len(places) :]:
         axes.remove()
     put_legend(figure, point_entries({str(row["arm"]) for row in rows}))
     caption = (
-        "Eq. 5 before a body was built, against the best return on it: a point for each design, both as a reward per "
-        "step. Dashed: equal."
+        "What was predicted of a body before it was built, against the best return on it: a point for each design, "
+        "both as a reward per step. Dashed: equal."
     )
     notes = (
-        "(1 - gamma) Q and return / steps are equal if the reward is constant.",
+        f"{PREDICTION} As reward per step these are expected return / steps and (1 - gamma) Q, which is equal to "
+        "return / steps if the reward is constant.",
         "Q weighs the first 1 / (1 - gamma) steps and is that of the population's policy; the return is that of the "
         f"best individual policy. {ENTROPY}",
         runs.in_words(runs.arms),

@@ -11,7 +11,15 @@ from pathlib import Path
 import matplotlib as mpl
 
 from coim.experiments.drawing.layout import FONT
-from coim.experiments.figures import best_returns, cartpole, comparisons, design_plane, error_curves, from_scratch
+from coim.experiments.figures import (
+    best_returns,
+    cartpole,
+    comparisons,
+    design_plane,
+    error_curves,
+    from_scratch,
+    summary,
+)
 from coim.experiments.figures.plot import Plot
 from coim.experiments.model_error.tables import FOLDER
 from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, written_aside
@@ -22,7 +30,7 @@ from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import read_runs
 from coim.run_folder import read_config
 
-MODULES = (best_returns, from_scratch, error_curves, design_plane, cartpole, comparisons)
+MODULES = (summary, best_returns, from_scratch, error_curves, design_plane, cartpole, comparisons)
 OF_MODELS = (error_curves, design_plane, cartpole)  # what a folder without cells has, Fig. 4
 SUFFIXES = ("png", "pdf", "csv", "md")
 TITLE = "# Figures of "

@@ -9,17 +9,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from scipy import stats
 from scipy.optimize import brentq
 
-from coim.experiments.frames import at, design_columns_of, spearman
+from coim.experiments.frames import at, spearman
+from coim.experiments.predictions import coverage
 from coim.experiments.statistics.intervals import Statistic, holm, improvement, interval, mean
+from coim.experiments.statistics.predicted import bias, later_predictions, spearman_given
 from coim.experiments.study.arms import pairs_of_arms
 from coim.experiments.study.runs import Place, Run, Runs
 
 Cells = dict[str, object]
 MEASURES = ("area", "final")
+COMPARED = (*MEASURES, "retrained")
 ALPHA, POWER = 0.05, 0.8
 
 NO_PAIRS: Cells = {"paired_difference_low": math.nan, "paired_difference_high": math.nan}
@@ -44,8 +46,9 @@ NUMBERS = (
     "area",
     "final",
     "search_gain",
-    "correlation",
-    "correlation_given_order",
+    "rank_correlation",
+    "rank_correlation_raw",
+    "coverage",
     "bias_optimised",
     "bias_random",
     "hours",
@@ -70,16 +73,18 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         ``final``
             the highest best return of all designs: what is in hand when the budget is spent.
         ``search_gain``
-            mean best return of the designs that maximised Q minus that of the random ones, which take turns.
-        ``correlation``
-            Spearman's, of the prediction Q(xi) before a body was built and the best return on it, over the bodies that
-            came after the first ones.
-        ``correlation_given_order``
-            the same with the order of building held fixed: Q and returns both rise while the networks learn, whatever
-            the body.
+            mean best return of the designs that were searched for minus that of the random ones, which take turns.
+        ``rank_correlation``
+            Spearman's, of the prediction before a body was built and the best return on it, over the bodies that came
+            after the first ones, with the order of building held fixed: predictions and returns both rise while the
+            networks learn, whatever the body. For what predicts see `statistics.predicted`.
+        ``rank_correlation_raw``
+            the same without holding the order fixed.
+        ``coverage``
+            share of these best returns within the 90 % interval of what a posterior expected. The deviation of
+            ``designs.csv`` holds how much the returns of one body vary, so that a return can be held against it.
         ``bias_optimised``
-            mean of prediction minus best return over the designs that maximised Q, both as reward per step; see
-            `predictions`.
+            mean of prediction minus best return over the designs that were searched for, both as reward per step.
         ``bias_random``
             the same over random designs.
         ``hours``
@@ -92,10 +97,7 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         All but the last three are NaN while they are not known; area, final and search_gain while the run is under way.
     """
     values = run.best_returns(failure) if run.over else np.array([math.nan])
-    chosen = predictions(run)
-    chosen = chosen[chosen["kind"] != "first"]
-    if len(chosen[design_columns_of(chosen)].drop_duplicates()) < 2:
-        chosen = chosen[:0]  # with one body alone there is nothing to rank
+    chosen = later_predictions(run)
     settings, rows = run.record.settings, run.record.episodes
     own = rows[rows["run"] == run.number]
     an_episode = settings["individual_updates"] + settings["population_updates"]
@@ -115,8 +117,9 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         "area": float(values.mean()),
         "final": float(values.max()),
         "search_gain": best_mean(run, "optimised") - best_mean(run, "random") if run.over else math.nan,
-        "correlation": spearman(chosen["predicted"], chosen["best_return"]),
-        "correlation_given_order": spearman_given(chosen["predicted"], chosen["best_return"], given=chosen["design"]),
+        "rank_correlation": spearman_given(chosen["predicted"], chosen["best_return"], given=chosen["design"]),
+        "rank_correlation_raw": spearman(chosen["predicted"], chosen["best_return"]),
+        "coverage": coverage(chosen).share,
         "bias_optimised": bias(chosen[chosen["kind"] == "optimised"]),
         "bias_random": bias(chosen[chosen["kind"] == "random"]),
         "hours": float(rows["seconds"].max()) / 3600,
@@ -131,39 +134,6 @@ def best_mean(run: Run, kind: str) -> float:
     return float(np.mean(values.to_numpy())) if len(values) else math.nan
 
 
-def spearman_given(x: ArrayLike, y: ArrayLike, *, given: ArrayLike) -> float:
-    """Partial rank correlation with a third variable held fixed.
-
-    NaN for less than four values, or where the third variable determines one of the others.
-    """
-    x_y, x_z, y_z = spearman(x, y), spearman(x, given), spearman(y, given)
-    rest = (1 - x_z**2) * (1 - y_z**2)
-    return (x_y - x_z * y_z) / math.sqrt(rest) if len(np.asarray(x)) > 3 and rest > 1e-12 else math.nan
-
-
-def bias(rows: pd.DataFrame) -> float:
-    """Mean of prediction minus best return, both as reward per step; NaN for no rows."""
-    errors = (rows["predicted_per_step"] - rows["return_per_step"]).to_numpy()
-    return float(np.mean(errors)) if len(errors) else math.nan
-
-
-def predictions(run: Run) -> pd.DataFrame:
-    """Designs with a prediction and a best return, both also as reward per step.
-
-    A constant reward r has the discounted value r / (1 - gamma) and, over T steps, the return r T. So (1 - gamma) Q and
-    return / T are both a mean reward per step, and agree if the reward is the same all the time. They are not the same
-    mean otherwise: Q weighs the first 1 / (1 - gamma) steps after a start, the return all T alike; Q is of the
-    population's policy before anything was learnt on the body, the return the best of the individual policy after it;
-    and Q holds the entropy bonus of Eq. 3, of up to alpha times the entropy of an action in each step.
-    """
-    gamma, steps = run.record.settings["gamma"], run.record.settings["episode_steps"]
-    rows = run.designs[np.isfinite(run.designs["predicted"])]
-    return rows.assign(
-        predicted_per_step=(1 - gamma) * rows["predicted"],
-        return_per_step=rows["best_return"] / steps,
-    )
-
-
 def comparisons(runs: Runs, measured: pd.DataFrame) -> pd.DataFrame:
     """Compare every pair of arms by every measure, in each environment and task and, where there are several, over all.
 
@@ -171,20 +141,20 @@ def comparisons(runs: Runs, measured: pd.DataFrame) -> pd.DataFrame:
 
     Args:
         runs: of the study.
-        measured: see `measures`.
+        measured: see `measures` and `coim.experiments.statistics.retrained.with_retrained`.
 
     Returns:
         A row for each comparison; empty where there is none.
     """
     tables = []
-    for name in MEASURES:
+    for name in COMPARED:
         known = measured[measured["over"] & np.isfinite(measured[name])]
         pairs = pairs_of_arms(runs.arms)
         table = pd.DataFrame([row for arm, against in pairs for row in compare(runs, known, name, arm, against)])
         for test in ("welch_p", "paired_p") if len(table) else ():
             table[f"{test}_holm"] = holm(table[test])
-        tables.append(table)
-    return pd.concat(tables, ignore_index=True)
+        tables += [table] if len(table) else []
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def compare(runs: Runs, known: pd.DataFrame, name: str, arm: str, against: str) -> Iterator[Cells]:

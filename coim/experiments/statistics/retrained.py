@@ -30,11 +30,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from coim.experiments.frames import at, rows_of
+from coim.experiments.frames import at, read_frame, rows_of
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, SEED, holm
 from coim.experiments.statistics.measures import welch
 from coim.experiments.study.arms import in_order, pairs_of_arms
-from coim.experiments.study.runs import Place, Run, runs_of_folder
+from coim.experiments.study.runs import CHOSEN, Place, Run, runs_of_folder
 
 TESTS = ("welch_designs_p", "welch_runs_p")
 
@@ -144,6 +144,28 @@ def results(folder: Path, listed: pd.DataFrame) -> tuple[pd.DataFrame, int]:
     if not counts:
         return kept, len(over)
     return kept.join(pd.concat(counts).add_prefix("arm_")), len(over) - len(kept)
+
+
+def with_retrained(measured: pd.DataFrame, study: Path) -> pd.DataFrame:
+    """Add what came of the best body of each run, by its return in the study, when it was trained from scratch.
+
+    Args:
+        measured: a row for each run, see `coim.experiments.statistics.measures.measures`.
+        study: its folder.
+
+    Returns:
+        The same rows with ``retrained``, the best return of that training; NaN where there was none yet. Where only a
+        share of a run's designs may be retrained, such as the optimised ones, it is the best of these.
+    """
+    run = ["environment", "task", "arm", "seed", "run"]
+    folder = study / "retrained"
+    listed = read_frame(folder / CHOSEN.file, CHOSEN)
+    rows, _ = results(folder, listed)
+    if rows.empty:
+        return measured.assign(retrained=math.nan)
+    best = listed.sort_values("found_return", kind="stable").drop_duplicates(run, keep="last")[[*run, "design"]]
+    found = best.merge(rows[[*run, "design", "best_return"]], on=[*run, "design"])
+    return measured.merge(found.rename(columns={"best_return": "retrained"})[[*run, "retrained"]], how="left", on=run)
 
 
 def result(line: Mapping[str, Any], run: Run) -> dict[str, Any]:

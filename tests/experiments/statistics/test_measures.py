@@ -16,9 +16,10 @@ from coim.experiments.statistics.measures import (
     measure,
     measures,
     paired,
-    spearman_given,
     welch,
 )
+from coim.experiments.statistics.predicted import spearman_given
+from coim.experiments.statistics.retrained import with_retrained
 from coim.experiments.study.arms import pairs_of_arms
 from coim.experiments.study.definition import Study, to_json
 from coim.experiments.study.runs import parts_of, read_runs
@@ -75,12 +76,26 @@ def test_first_designs_and_a_body_that_never_changes_say_nothing_of_the_ranking(
     (run,) = read_runs(tmp_path).found
     found = measure(run, failure=0)
     for value in (
-        found["correlation"],
-        found["correlation_given_order"],
+        found["rank_correlation"],
+        found["rank_correlation_raw"],
         found["bias_optimised"],
         found["bias_random"],
     ):
         assert math.isnan(value)
+
+
+def test_what_a_posterior_expected_is_the_prediction_of_its_run_and_its_interval_is_counted(tmp_path: Path) -> None:
+    kinds = ("first", "optimised", "random", "optimised", "random")
+    expected = [None, (50.0, 10.0), (40.0, 10.0), (30.0, 10.0), (20.0, 10.0)]
+    returns = [90, 50 + 16, 40 - 17, 30 + 17, 20 - 16]  # 1.645 deviations are within
+    write_cell(tmp_path, "hopper-forward-grounded-0", returns, kinds=kinds, expected=expected, num_designs=5)
+    write_cell(tmp_path, "hopper-forward-none-0", returns, kinds=kinds, num_designs=5)
+    runs = {run.arm: measure(run, failure=0) for run in read_runs(tmp_path).found}
+    assert runs["grounded"]["coverage"] == 0.5
+    assert math.isnan(runs["none"]["coverage"])
+    assert runs["grounded"]["rank_correlation_raw"] == pytest.approx(spearman([4, 3, 2, 1], returns[1:]))
+    assert runs["none"]["rank_correlation_raw"] == -runs["grounded"]["rank_correlation_raw"]  # Q rises
+    assert runs["grounded"]["bias_optimised"] == pytest.approx(((50 - 66) + (30 - 47)) / 2 / 10)  # ten steps
 
 
 def test_who_learns_no_model_has_no_updates_of_it(tmp_path: Path) -> None:
@@ -218,7 +233,7 @@ def test_comparisons_pair_by_seed_correct_each_measure_by_itself_and_join_the_pl
             write_cell(tmp_path, f"hopper-{task}-none-{seed}", [theirs[seed]] * 4)
     write_cell(tmp_path, "hopper-forward-none-7", [20.0] * 4)  # has no partner
     runs = read_runs(tmp_path)
-    rows = comparisons(runs, measures(runs)).to_dict("records")
+    rows = comparisons(runs, with_retrained(measures(runs), tmp_path)).to_dict("records")
     assert [(row["measure"], row["task"]) for row in rows] == [
         (name, task) for name in ("area", "final") for task in ("backward", "forward", "all")
     ]

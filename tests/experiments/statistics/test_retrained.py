@@ -16,8 +16,9 @@ from coim.experiments.figures import from_scratch
 from coim.experiments.figures.plot import Plot
 from coim.experiments.figures.write import write_figures
 from coim.experiments.statistics import retrained as retrained_pairs
-from coim.experiments.statistics.measures import welch
-from coim.experiments.statistics.retrained import interval_over_runs, pairs
+from coim.experiments.statistics.measures import comparisons, measures, welch
+from coim.experiments.statistics.retrained import interval_over_runs, pairs, with_retrained
+from coim.experiments.study.runs import read_runs
 from tests.experiments.made_up_study import check_words, read_table, write_cell, write_ledger, write_table
 
 PLACE = ("hopper", "forward")
@@ -226,6 +227,27 @@ def test_designs_that_were_chosen_before_the_study_grew_say_so(tmp_path: Path) -
         "Chosen before all runs were over (hopper, forward, known: 2 of 5 planned now); designs of the others had no "
         "chance." in drawn(tmp_path)[0].notes
     )
+
+
+def test_the_best_body_of_each_run_is_compared_by_what_its_retraining_earned(tmp_path: Path) -> None:
+    chosen = {"none": [1.0, 2.0], "random-bodies": [1.5, 0.5]}
+    for arm, returns in chosen.items():
+        for seed in range(len(returns)):
+            write_cell(tmp_path, f"hopper-forward-{arm}-{seed}", [10, 20, 30, 40])
+    lines = write_retrained(tmp_path, {arm: of_seeds(*returns) for arm, returns in chosen.items()})
+    write_cell(tmp_path, "second", [99], part="retrained/cells", num_designs=1)
+    list_designs(tmp_path, [*lines, lines[0] | {"folder": "second", "design": 7, "found_return": 29}])  # not the best
+    runs = read_runs(tmp_path)
+    measured = with_retrained(measures(runs), tmp_path)
+    assert measured.set_index(["arm", "seed"])["retrained"].to_dict() == {
+        (arm, seed): value for arm, returns in chosen.items() for seed, value in enumerate(returns)
+    }
+    (row,) = (row for row in comparisons(runs, measured).to_dict("records") if row["measure"] == "retrained")
+    assert (row["arm"], row["against"], row["improvement"]) == ("random-bodies", "none", 0.25)  # of four pairs one
+    list_designs(tmp_path, [lines[1]])
+    assert with_retrained(measures(runs), tmp_path)["retrained"].notna().sum() == 1
+    (tmp_path / "retrained" / "designs.csv").unlink()
+    assert with_retrained(measures(runs), tmp_path)["retrained"].isna().all()
 
 
 @pytest.mark.parametrize(

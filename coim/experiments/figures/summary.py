@@ -1,0 +1,118 @@
+"""The summary of a study: every measure of every arm with its interval and the runs behind it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.palette import GREY
+from coim.experiments.figures.comparisons import INTERVALS
+from coim.experiments.figures.plot import Cells, Plot, missing, with_interval
+from coim.experiments.frames import at, rows_of
+from coim.experiments.predictions import LEVEL
+from coim.experiments.statistics.measures import measures
+from coim.experiments.statistics.retrained import with_retrained
+from coim.experiments.statistics.summary import SUMMARISED, named, summary
+from coim.experiments.study.arms import arm_named
+from coim.experiments.study.runs import Place, Runs, read_runs
+
+LABELS = {
+    "search_gain": "search_gain: searched\nminus random bodies (1)",
+    "area": "area: mean best return\nof a design (1)",
+    "final": "final: highest\nbest return (1)",
+    "rank_correlation": "rank_correlation of\npredicted and achieved (1)",
+    "coverage": f"coverage of {LEVEL:.0%}\nintervals (1)",
+    "retrained": "retrained: best body,\nfrom scratch (1)",
+}
+MARKS = {"search_gain": 0.0, "rank_correlation": 0.0, "coverage": LEVEL}  # dashed lines
+IN_A_LINE = 3
+FLAT, LETTER = 3, 0.06  # names of so many arms fit side by side below a panel; inches of a letter
+CAPTION = (
+    "Every measure of every arm. Points: runs. Bars: mean over runs and its 95 % bootstrap interval. Dashed: no gain, "
+    "no correlation, and the coverage that is aimed at."
+)
+NOTES = (
+    "search_gain: mean best return of the bodies that were searched for minus that of random ones. area: mean best "
+    "return of a design. final: highest best return of all designs.",
+    "rank_correlation: Spearman's, of the prediction before a body was built and the best return on it, over the "
+    "bodies after the first ones, with the order of building held fixed. The prediction is the return that a posterior "
+    "expected where one chose the bodies, and Eq. 5 in all other runs.",
+    f"coverage: share of these best returns within the {LEVEL:.0%} interval of what the posterior expected. The "
+    "interval is of a return, so it holds how much returns of one body vary, not only how uncertain their mean is.",
+    "retrained: best return of the best body of a run when it is trained from scratch; of the best among those that "
+    "coim retrain has chosen.",
+    f"{INTERVALS} A measure that no run of an arm has is left out.",
+)
+
+
+def plots(study: Path) -> Iterator[Plot]:
+    """One figure and ``summary.csv``."""
+    runs = read_runs(study)
+    measured = with_retrained(measures(runs), study)
+    rows = summary(runs, measured)
+    if rows.empty:
+        yield missing("summary", "No run has tried all its designs yet.", runs.in_words(runs.arms))
+        return
+    yield draw(runs, measured[measured["over"]], rows)
+
+
+def draw(runs: Runs, over: pd.DataFrame, rows: pd.DataFrame) -> Plot:
+    """A panel for each measure that any run has; an environment begins a line of its own."""
+    panels: list[tuple[Place, str] | None] = []
+    for place in runs.places:
+        panels += [(place, name) for name in SUMMARISED if len(of_measure(rows, place, name))]
+        panels += [None] * (-len(panels) % IN_A_LINE)
+    lines = len(panels) // IN_A_LINE
+    longest = max(map(len, rows["arm"])) * LETTER * (rows["arm"].nunique() > FLAT)
+    figure, grid = new_figure((1.9 + longest) * lines, lines, IN_A_LINE)
+    for axes, panel in zip(grid, panels):
+        if panel is None:
+            axes.remove()
+        else:
+            draw_measure(axes, *panel, over, of_measure(rows, *panel))
+    return Plot(
+        name="summary",
+        figure=figure,
+        rows=rows_of(rows),
+        caption=CAPTION,
+        notes=(*NOTES, runs.in_words(runs.arms, counted=True)),
+        table=table(rows),
+    )
+
+
+def of_measure(rows: pd.DataFrame, place: Place, name: str) -> pd.DataFrame:
+    """The rows of one measure in one environment, by arm."""
+    return rows[(rows["environment"] == named(place)) & (rows["measure"] == name)].set_index("arm")
+
+
+def draw_measure(axes: Axes, place: Place, name: str, over: pd.DataFrame, rows: pd.DataFrame) -> None:
+    """One measure of the arms that have it: a point for each run, and the mean with its interval."""
+    for x, arm in enumerate(rows.index):
+        values, look = at(over, place, arm)[name].dropna().to_numpy(), arm_named(arm)
+        spread = x + np.linspace(-0.22, 0.22, len(values) + 2)[1:-1]
+        axes.scatter(spread, values, s=12, alpha=0.6, linewidth=0, **look.point)
+        axes.vlines(x, rows["low"][arm], rows["high"][arm], color=look.colour, linewidth=2.5)
+        axes.hlines(rows["mean"][arm], x - 0.3, x + 0.3, color=look.colour, linewidth=2.5)
+    if name in MARKS:
+        axes.axhline(MARKS[name], color=GREY, linestyle="--", linewidth=0.8, zorder=0)
+    axes.set_xticks(range(len(rows)), list(rows.index), fontsize=7, rotation=90 * (len(rows) > FLAT))
+    axes.set(ylabel=LABELS[name], title=", ".join(place), xlim=(-0.6, len(rows) - 0.4))
+
+
+def table(rows: pd.DataFrame) -> list[Cells]:
+    """A row for each environment and arm, a column for each measure that any of them has."""
+    there = [name for name in SUMMARISED if (rows["measure"] == name).any()]
+    found: list[Cells] = []
+    for (environment, arm), own in rows.groupby(["environment", "arm"], sort=False):
+        cells = {
+            row["measure"]: with_interval({"m": row["mean"], "m_low": row["low"], "m_high": row["high"]}, "m")
+            for row in rows_of(own)
+        }
+        found.append({"environment": environment, "arm": arm} | {name: cells.get(name, math.nan) for name in there})
+    return found
