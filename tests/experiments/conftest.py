@@ -4,8 +4,27 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the figures of studies and pages, and leave out what takes longest: their files and pictures are blank.
+
+    For tests of what stands in tables and in words beside them.
+    """
+    from coim.experiments.report import page
+
+    blank = page.svg(Figure(figsize=(7, 3)))
+
+    def touch(figure: Figure, path: Path, **how: object) -> None:
+        path.touch()
+
+    monkeypatch.setattr(Figure, "savefig", touch)
+    monkeypatch.setattr(page, "svg", lambda figure: blank)
 
 
 @pytest.fixture(scope="session")

@@ -3,42 +3,23 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 import sys
 from pathlib import Path
 from typing import get_args
 
 import pytest
+from tiny_runs import resume, run_by_options
 
 from coim import HopperMorph
 from coim.events import Kind
 from coim.experiments.drawing.palette import KINDS
+from coim.experiments.report.run_report import write_report
 from coim.experiments.run.build import episodes_of_designs, make_buffers
 from coim.experiments.run.command_line import parse
-from coim.experiments.run.last_words import options
 from coim.experiments.run.settings import PRESETS, Settings
-from coim.experiments.study.definition import PROTOCOLS
-from coim.experiments.train import main
 
 XI = ["xi_torso", "xi_thigh", "xi_shank", "xi_foot"]
-# Options of the smallest run that has every kind of design, and those of them that have no effect beside some others.
-TINY = options(dataclasses.replace(PROTOCOLS["smoke"], num_designs=7))
-IDLE_BESIDE = {
-    **{word: {"--model-updates", "--model-cells"} for word in ("none", "simulator")},
-    **{word: {"--num-particles", "--num-iterations"} for word in ("fixed", "gradient")},
-}
-
-
-def tiny(*given: str) -> list[str]:
-    """Options of a tiny run, without those that have no effect beside the given ones."""
-    idle = set().union(*(IDLE_BESIDE.get(word, set()) for word in given))
-    words = [word for pair in zip(TINY[::2], TINY[1::2]) if pair[0] not in idle for word in pair]
-    return [*words, *given]
-
-
-def run(folder: Path, *options: str) -> None:
-    main(HopperMorph, "hopper", tiny("--out", str(folder), *options))
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -47,7 +28,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def test_a_run_leaves_its_settings_its_numbers_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run(tmp_path / "run")
+    run_by_options(tmp_path / "run", page=True)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     evaluations, designs = read(tmp_path / "run" / "evaluations.csv"), read(tmp_path / "run" / "designs.csv")
     assert config["environment"] == "hopper"
@@ -67,7 +48,7 @@ def test_a_run_leaves_its_settings_its_numbers_and_a_picture(tmp_path: Path, cap
 
 
 def test_what_was_measured_while_learning_has_a_row_for_each_run_and_episode(tmp_path: Path) -> None:
-    run(tmp_path / "fleet", "--num-runs", "2", "--num-designs", "2", "--first-episodes", "2", "--quiet")
+    run_by_options(tmp_path / "fleet", "--num-runs", "2", "--num-designs", "2", "--first-episodes", "2", "--quiet")
     rows = read(tmp_path / "fleet" / "metrics.csv")
     assert [(row["run"], row["design"], row["episode"]) for row in rows] == [
         (run, design, episode) for design in "12" for episode in "12" for run in "01"
@@ -86,7 +67,7 @@ def test_what_was_measured_while_learning_has_a_row_for_each_run_and_episode(tmp
 
 def test_the_same_seed_repeats_and_another_does_not(tmp_path: Path) -> None:
     for name, seed in (("a", "0"), ("b", "0"), ("c", "1")):
-        run(tmp_path / name, "--seed", seed, "--quiet")
+        run_by_options(tmp_path / name, "--seed", seed, "--quiet")
     a, b, c = ([row["return"] for row in read(tmp_path / name / "evaluations.csv")] for name in "abc")
     assert a == b
     assert a != c
@@ -94,7 +75,7 @@ def test_the_same_seed_repeats_and_another_does_not(tmp_path: Path) -> None:
 
 def test_the_baseline_differs_from_the_method_by_imagination_alone(tmp_path: Path) -> None:
     for designs in ("known", "none"):
-        run(tmp_path / designs, "--imagine", designs, "--quiet")
+        run_by_options(tmp_path / designs, "--imagine", designs, "--quiet")
     ours, theirs = (read(tmp_path / designs / "evaluations.csv") for designs in ("known", "none"))
     # Until the population has learnt for the first time, nothing that was imagined reaches anything.
     assert ours[0]["training_return"] == theirs[0]["training_return"]
@@ -106,21 +87,21 @@ def test_the_baseline_differs_from_the_method_by_imagination_alone(tmp_path: Pat
 
 
 def test_runs_in_lock_step_have_a_row_each(tmp_path: Path) -> None:
-    run(tmp_path / "fleet", "--num-runs", "3", "--imagine", "noisy", "--task", "backward", "--quiet")
+    run_by_options(tmp_path / "fleet", "--num-runs", "3", "--imagine", "noisy", "--task", "backward", "--quiet")
     designs = read(tmp_path / "fleet" / "designs.csv")
     assert [row["run"] for row in designs] == ["0", "1", "2"] * 7
     assert len({row["xi_torso"] for row in designs if row["kind"] == "random"}) == 3
 
 
 def test_the_baseline_imagines_nothing_and_quiet_is_quiet(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run(tmp_path / "run", "--imagine", "none", "--quiet")
+    run_by_options(tmp_path / "run", "--imagine", "none", "--quiet")
     assert {row["model_error"] for row in read(tmp_path / "run" / "evaluations.csv")} == {""}
     assert capsys.readouterr().out == ""
 
 
 def test_offline_wandb_needs_no_account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    run(tmp_path / "run", "--wandb", "offline", "--num-designs", "1", "--quiet")
+    run_by_options(tmp_path / "run", "--wandb", "offline", "--num-designs", "1", "--quiet")
     assert list((tmp_path / "run").glob("wandb/offline-run-*/*.wandb"))
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -145,7 +126,7 @@ def test_bad_options_get_a_sentence_and_leave_no_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture, options: list[str], sentence: str
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        run(tmp_path / "run", *options)
+        run_by_options(tmp_path / "run", *options)
     assert stop.value.code not in (0, None)
     assert sentence in f"{stop.value.code} {capsys.readouterr().err}"
     assert not (tmp_path / "run").exists()
@@ -154,7 +135,7 @@ def test_bad_options_get_a_sentence_and_leave_no_folder(
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "evaluations.csv").write_text("precious")
     with pytest.raises(SystemExit) as stop:
-        run(tmp_path)
+        run_by_options(tmp_path)
     assert "already holds something" in str(stop.value.code)
     assert [path.name for path in tmp_path.iterdir()] == ["evaluations.csv"]
     assert (tmp_path / "evaluations.csv").read_text() == "precious"
@@ -186,8 +167,8 @@ def test_the_papers_numbers_are_the_defaults() -> None:
 
 
 def test_the_simulator_imagines_and_no_model_is_learnt(tmp_path: Path) -> None:
-    run(tmp_path / "oracle", "--imagine", "random", "--dream", "simulator", "--num-designs", "2", "--quiet")
-    run(tmp_path / "none", "--imagine", "none", "--num-designs", "2", "--quiet")
+    run_by_options(tmp_path / "oracle", "--imagine", "random", "--dream", "simulator", "--num-designs", "2", "--quiet")
+    run_by_options(tmp_path / "none", "--imagine", "none", "--num-designs", "2", "--quiet")
     ours, theirs = (read(tmp_path / name / "evaluations.csv") for name in ("oracle", "none"))
     assert [row["model_error"] for row in ours] == [""] * 2
     assert "model/loss_dynamics" not in read(tmp_path / "oracle" / "metrics.csv")[0]
@@ -200,7 +181,7 @@ def test_impossible_pairs_are_counted_in_the_tables_and_matched_states_have_none
     shares = {}
     for states in ("stored", "matched"):
         how = ("--imagine", "random", "--imagined-states", states, "--value-states", states)
-        run(tmp_path / states, *how, "--num-designs", "4", "--quiet")
+        run_by_options(tmp_path / states, *how, "--num-designs", "4", "--quiet")
         shares[states] = [float(row["impossible"]) for row in read(tmp_path / states / "metrics.csv")]
     assert shares["matched"] == [0] * 4
     assert max(shares["stored"]) > 0
@@ -208,15 +189,15 @@ def test_impossible_pairs_are_counted_in_the_tables_and_matched_states_have_none
 
 def test_a_governed_run_whose_model_has_learnt_too_little_is_the_baseline(tmp_path: Path) -> None:
     how = ("--imagine", "random", "--imagined-states", "matched", "--anchored", "--governed")
-    run(tmp_path / "governed", *how, "--num-designs", "3", "--quiet")
-    run(tmp_path / "none", "--imagine", "none", "--num-designs", "3", "--quiet")
+    run_by_options(tmp_path / "governed", *how, "--num-designs", "3", "--quiet")
+    run_by_options(tmp_path / "none", "--imagine", "none", "--num-designs", "3", "--quiet")
     ours, theirs = (read(tmp_path / name / "evaluations.csv") for name in ("governed", "none"))
     assert [row["return"] for row in ours] == [row["return"] for row in theirs]
     assert [float(row["imagined_share"]) for row in read(tmp_path / "governed" / "metrics.csv")] == [0, 0, 0]
 
 
 def test_a_fixed_body_is_marked_as_such(tmp_path: Path) -> None:
-    run(tmp_path / "fixed", "--imagine", "none", "--bodies", "fixed", "--quiet")
+    run_by_options(tmp_path / "fixed", "--imagine", "none", "--bodies", "fixed", "--quiet", page=True)
     designs = read(tmp_path / "fixed" / "designs.csv")
     assert [row["kind"] for row in designs] == ["fixed"] * 7
     assert all(float(row[name]) == 1 for row in designs for name in XI)
@@ -240,7 +221,9 @@ def test_a_body_may_have_more_first_designs_than_the_papers(tmp_path: Path) -> N
 
 
 def test_a_run_can_begin_with_one_body_of_its_own(tmp_path: Path) -> None:
-    run(tmp_path, "--first-design", "0.8", "1.2", "1", "1.5", "--num-designs", "2", "--first-episodes", "2", "--quiet")
+    run_by_options(
+        tmp_path, "--first-design", "0.8", "1.2", "1", "1.5", "--num-designs", "2", "--first-episodes", "2", "--quiet"
+    )
     rows = read(tmp_path / "evaluations.csv")
     assert [row["kind"] for row in rows] == ["first", "first", "optimised"]
     assert [float(rows[0][name]) for name in XI] == [0.8, 1.2, 1, 1.5]
@@ -251,19 +234,19 @@ def test_a_run_whose_bodies_are_chosen_by_returns_writes_what_it_expects_and_goe
     chosen_by: str, tmp_path: Path
 ) -> None:
     words = ["--imagine", "none", "--search", "gradient", "--chosen-by", chosen_by, "--value-over", "visited"]
-    run(tmp_path / "whole", *words)
-    run(tmp_path / "part", *words, "--num-designs", "6")
-    main(HopperMorph, "hopper", ["--resume", str(tmp_path / "part"), "--num-designs", "7"])
+    run_by_options(tmp_path / "whole", *words)
+    run_by_options(tmp_path / "part", *words, "--num-designs", "6")
+    resume(tmp_path / "part", "--num-designs", "7")
     whole, part = (read(tmp_path / name / "designs.csv") for name in ("whole", "part"))
     assert whole == part
     known = [row["expected"] != "" and row["deviation"] != "" for row in whole]
     assert known == [False] * 3 + [True] * 4  # from three returns on
     assert all(float(row["deviation"]) > 0 for row in whole[3:])
-    assert (tmp_path / "whole" / "report.html").exists()
+    assert write_report([tmp_path / "whole"]).exists()
 
 
 def test_a_run_by_eq_5_has_no_columns_of_what_is_expected(tmp_path: Path) -> None:
-    run(tmp_path / "run")
+    run_by_options(tmp_path / "run")
     assert not {"expected", "deviation"} & read(tmp_path / "run" / "designs.csv")[0].keys()
 
 
@@ -273,4 +256,4 @@ def test_returns_without_botorch_are_refused_in_a_sentence(tmp_path: Path, monke
     monkeypatch.setitem(sys.modules, "botorch", None)
     monkeypatch.setitem(sys.modules, "botorch.settings", None)
     with pytest.raises(SystemExit, match=r"pip install 'coim\[posterior\]', or choose bodies by value"):
-        run(tmp_path / "run", "--chosen-by", "returns")
+        run_by_options(tmp_path / "run", "--chosen-by", "returns")

@@ -52,6 +52,7 @@ def study(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_figures_of_an_archive_are_those_of_the_study_without_what_was_under_way(
     study: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from pathlib import Path
 
 import pytest
+from tiny_runs import tiny
 
-from coim import HopperMorph
-from coim.experiments import train as experiment
 from coim.experiments.commands.retrain import episodes_in_words, main
-from coim.experiments.figures.write import write_figures
 from coim.experiments.frames import read_frame
 from coim.experiments.run.command_line import parse
 from coim.experiments.run.settings import Settings, plain
 from coim.experiments.study.retraining import Retrain, best_designs, cell_of, choose
 from coim.experiments.study.runs import CHOSEN, read_runs
-from coim.tables import design_columns
-from tests.experiments.made_up_study import read_table, write_cell
-from tests.experiments.test_train import TINY, tiny
+from tests.experiments.made_up_study import write_cell
 
-XI = design_columns(HopperMorph.design_names())
 PLACE = ("hopper", "forward")
 
 
@@ -155,43 +149,6 @@ def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_on
     other = cell_of(lines[1], Retrain(study=study)).settings
     assert own.seed != other.seed
     assert other.first_episodes == settings.first_episodes
-
-
-@pytest.mark.usefixtures("cluster")
-def test_designs_are_retrained_once_and_drawn(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "coim.experiments.commands.retrain.ray_running", lambda *_, **__: contextlib.nullcontext()
-    )  # on the cluster there is
-    for arm in ("none", "known"):
-        folder = tmp_path / "cells" / f"hopper-forward-{arm}-0"
-        experiment.main(HopperMorph, "hopper", tiny("--imagine", arm, "--quiet", "--out", str(folder)))
-    with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
-        main([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
-    capsys.readouterr()
-    main([str(tmp_path), "--episodes", "2", "--workers", "1"])
-    said = capsys.readouterr().out
-    assert "2 of 2 designs to train" in said
-    assert "\n2 training episodes on each\n" in said
-    chosen = read_table(tmp_path / "retrained" / "designs.csv")
-    for line in chosen:
-        cell = tmp_path / "cells" / line["cell"]
-        found = next(row for row in read_table(cell / "designs.csv") if row["kind"] == "optimised")
-        episodes = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
-        assert [row["kind"] for row in episodes] == ["first", "first"]
-        assert [row["episode"] for row in episodes] == ["1", "2"]
-        assert all(row[name] == found[name] for row in episodes for name in XI)
-    main([str(tmp_path), "--episodes", "2", "--workers", "1"])
-    assert "0 of 2 designs to train" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match=r"made with other settings: first_episodes \(2 to 3\)"):
-        main([str(tmp_path), "--episodes", "3"])
-    write_figures(tmp_path)
-    rows = read_table(tmp_path / "figures" / "figure_2_retrained.csv")
-    for row, line in zip(rows, chosen, strict=True):
-        own = read_table(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
-        assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
-        assert (row["episodes"], row["study_episodes"]) == ("2", TINY[TINY.index("--episodes") + 1])
 
 
 def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
-from interrupted_runs import run
+from tiny_runs import run
 
 from coim import TriedDesign, load_run, run_episode
 from coim.experiments.commands.watch import Watch, main

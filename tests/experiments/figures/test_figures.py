@@ -33,6 +33,7 @@ def study(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_figures_of_a_study_that_is_not_ours_go_where_out_says_and_over_nothing_of_others(
     study: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -70,6 +71,7 @@ def test_every_figure_has_its_three_files_and_a_place_on_the_page(study: Path, c
     assert "Not drawn. No design was retrained" in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_csv_of_figure_1_holds_mean_iqm_interval_and_each_run(study: Path) -> None:
     write_figures(study)
     rows = read_table(study / "figures" / "figure_1_best_returns.csv")
@@ -87,6 +89,7 @@ def test_the_csv_of_figure_1_holds_mean_iqm_interval_and_each_run(study: Path) -
     assert [float(row["best_return"]) for row in single] == [14, 24]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_table_of_arms_counts_planned_and_diverged_runs(study: Path) -> None:
     names = [f"hopper-forward-{arm}-{seed}" for arm in ("none", "known") for seed in range(5)]
     write_ledger(study, dict.fromkeys(names, "waiting"))
@@ -114,6 +117,7 @@ def test_figures_repeat_to_the_last_bit(study: Path) -> None:
     assert first == {path.name: path.read_bytes() for path in (study / "figures").iterdir()}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_other_arms_have_a_figure_with_their_family_and_its_baselines(study: Path) -> None:
     write_cell(study, "hopper-forward-oracle-0", [1, 2, 3, 4])
     write_cell(study, "hopper-forward-control-only-0", [1, 2, 3, 4])
@@ -242,6 +246,7 @@ def test_the_page_tells_what_the_arms_do_and_places_of_other_arms_have_no_panel(
     assert "| known |" not in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_captions_are_short_and_tables_narrow_in_any_state_of_a_study(study: Path, tmp_path: Path) -> None:
     check_words(write_figures(study))
     empty = tmp_path / "empty"
@@ -266,6 +271,7 @@ def test_tables_and_captions_of_the_results_are_short_too(path: Path) -> None:
             assert len(caption.split()) <= 60 + 2  # and the links to the files
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_figures_that_are_called_otherwise_now_leave_none_behind(study: Path) -> None:
     write_figures(study)
     page = study / "figures" / "README.md"
@@ -279,6 +285,7 @@ def test_figures_that_are_called_otherwise_now_leave_none_behind(study: Path) ->
     assert there >= {"mine", "figure_1_best_returns"}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_runs_of_several_revisions_are_told_on_the_page(study: Path) -> None:
     write_figures(study)
     page = study / "figures" / "README.md"

@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from interrupted_runs import TINY, no_picture, power_cut
-from interrupted_runs import run as run_alone
+from interrupted_runs import power_cut
 from matplotlib.collections import QuadMesh
 from tensordict import TensorDict
+from tiny_runs import TINY, without_page
+from tiny_runs import run as run_alone
 
 from coim import HopperMorph, Policy
 from coim.experiments.commands.model_error import main
@@ -34,9 +35,7 @@ OPTIONS += ["--threads", "1", "--no-compile", "--quiet"]
 
 def measure(folder: Path, *options: str) -> Path:
     """One line on the command line, without the pictures of an ordinary run."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("coim.experiments.train.draw_run", no_picture)
-        patched.setattr("coim.experiments.train.write_report", lambda folders, body: folders[0])
+    with without_page(), pytest.MonkeyPatch.context() as patched:
         patched.setattr("coim.experiments.model_error.run.SIDE", 5)
         main(["hopper", *OPTIONS, "--every", "2", "--rows", "5", "--out", str(folder), *options])
     return folder

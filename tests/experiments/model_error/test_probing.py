@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from interrupted_runs import TINY
 from tensordict import TensorDict
+from tiny_runs import TINY
 from torch import Tensor
 
 from coim import HopperMorph, KnownDesigns, NoisyDesigns, RandomDesigns, make_policy, run_episode

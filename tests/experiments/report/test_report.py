@@ -14,15 +14,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from matplotlib.image import imread
+from tiny_runs import run_by_options
 
 from coim import HalfCheetahMorph, HopperMorph
-from coim.experiments import train as experiment
 from coim.experiments.commands.report import main
 from coim.experiments.frames import designs_of
 from coim.experiments.report.designs import describe_correlation
 from coim.experiments.report.run_report import write_report
 from coim.experiments.run.records import read_record, read_records
-from tests.experiments.test_train import tiny
 
 VOID = {"meta", "img", "br"}
 PICTURES = ["Best return of each design", "Learning curves", "Designs over time", "Bodies", "Predicted and achieved"]
@@ -100,7 +99,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     options = {"one": [], "fleet": ["--num-runs", "3"], "free": ["--num-runs", "2", "--imagine", "none"]}
     for name, more in options.items():
-        experiment.main(HopperMorph, "hopper", tiny("--quiet", "--out", str(folder / name), *more))
+        run_by_options(folder / name, "--quiet", *more, page=name == "one")
+        write_report([folder / name])
     return folder
 
 
@@ -108,9 +108,9 @@ def test_the_page_says_what_share_of_the_imagined_pairs_cannot_be(runs: Path, tm
     words = check(runs / "one" / "report.html").words
     assert "Share of imagined pairs with over 5 cm of the body in the floor" in words
     assert "share of a batch that is imagined" not in words
-    how = ["--quiet", "--num-designs", "2", "--governed"]
-    experiment.main(HopperMorph, "hopper", tiny("--out", str(tmp_path / "governed"), *how))
-    assert "Last: share of a batch that is imagined" in check(tmp_path / "governed" / "report.html").words
+    run_by_options(tmp_path / "governed", "--quiet", "--num-designs", "2", "--governed")
+    page = check(write_report([tmp_path / "governed"]))
+    assert "Last: share of a batch that is imagined" in page.words
 
 
 def under_way(folder: Path, copy: Path, *, rows: int, torn: str = "") -> Path:
@@ -136,6 +136,7 @@ def test_the_end_of_a_run_writes_a_page_with_every_picture_beside_the_old_one(ru
     assert "(n = 6 designs)" in page.words  # the first is built without a prediction
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_comparison_is_a_page_of_its_own(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -154,6 +155,7 @@ def test_a_comparison_is_a_page_of_its_own(
     assert own.read_bytes() == before
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_folder_in_which_only_others_may_write_is_answered_by_out(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +167,7 @@ def test_a_folder_in_which_only_others_may_write_is_answered_by_out(
         main([str(runs / "one")])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_body_that_is_not_ours_is_drawn_if_its_class_is_named(runs: Path, tmp_path: Path) -> None:
     theirs = shutil.copytree(runs / "one", tmp_path / "theirs")
     config = json.loads((theirs / "config.json").read_text())
@@ -218,6 +221,7 @@ def test_folders_become_a_comparison(runs: Path, tmp_path: Path, capsys: pytest.
     assert '<tr><th scope="row">task</th>' in out.read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_comparison_of_many_folders_has_several_tables_and_marks_differences_between_all(
     runs: Path, tmp_path: Path
 ) -> None:
@@ -247,6 +251,7 @@ def test_a_run_that_is_going_on_has_a_page(runs: Path, tmp_path: Path, rows: int
     assert "No design has both a prediction and a return yet" in page.words
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_from_before_there_were_metrics_has_a_page(runs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(runs / "one", tmp_path / "run")
     (folder / "metrics.csv").unlink()
@@ -275,6 +280,7 @@ def test_numbers_that_are_none_are_gaps(runs: Path, tmp_path: Path) -> None:
     assert best.index.tolist() == [0, 2]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_bodies_that_are_not_ours_are_not_drawn(runs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(runs / "one", tmp_path / "run")
     config = json.loads((folder / "config.json").read_text())
@@ -283,6 +289,7 @@ def test_bodies_that_are_not_ours_are_not_drawn(runs: Path, tmp_path: Path) -> N
     assert len(check(write_report([folder], body=HopperMorph)).images) == len(PICTURES)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("columns", "environment", "names"),
     [
@@ -361,11 +368,13 @@ def test_the_rank_correlation_is_told_of_each_run() -> None:
     assert describe_correlation(rising[:0]) == "rank correlation not defined (n = 0 designs)"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_long_runs_are_drawn_as_means_of_neighbouring_episodes(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coim.experiments.report.axes.MOST_EPISODES", 3)
     assert "A point is the mean of 3 episodes." in check(write_report([runs / "one"], out=runs / "long.html")).words
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", ["evaluations.csv", "designs.csv", "metrics.csv"])
 def test_a_page_is_not_made_of_half_a_table(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, name: str

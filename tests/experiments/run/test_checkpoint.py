@@ -10,7 +10,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from interrupted_runs import SAVES, TINY, PowerCut, cut, resume, run
+from interrupted_runs import SAVES, PowerCut, cut
+from tiny_runs import TINY, resume, run
 
 from benchmarks import soak
 from coim.experiments.run.checkpoint import Checkpoints

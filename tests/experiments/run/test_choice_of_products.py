@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from interrupted_runs import cut, resume, run
+from interrupted_runs import cut
+from tiny_runs import resume, run
 
 from coim import HopperMorph, products
 from coim.experiments.run.machine import choose_products, keep_freed_memory
@@ -35,11 +36,12 @@ def begun_with(folder: Path, choice: dict[str, str]) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_tells_and_notes_which_library_multiplies(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(products, "has_bfloat16", lambda: False)
-    run(tmp_path / "run", products="torch", precision="bfloat16", quiet=False, num_designs=1)
+    run(tmp_path / "run", products="torch", precision="bfloat16", quiet=False, num_designs=1, page=True)
     first, second = capsys.readouterr().out.splitlines()[:2]
     assert first.endswith(f"not compiled, products by torch, bfloat16 emulated -> {tmp_path / 'run'}")
     assert second == "bfloat16 is emulated by float32 products here, which is slower than --precision float32"

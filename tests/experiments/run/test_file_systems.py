@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from interrupted_runs import resume, run
+from tiny_runs import resume, run, run_by_options
 
 from benchmarks import soak
-from coim import HopperMorph, SACLearner, load_run
+from coim import SACLearner, load_run
 from coim.experiments.commands import report
 from coim.experiments.report.run_report import write_report
 from coim.experiments.run import atomic_write as writing
@@ -24,9 +24,7 @@ from coim.experiments.run.checkpoint import Checkpoints
 from coim.experiments.run.interrupt import locked
 from coim.experiments.run.replay_file import ReplayFile
 from coim.experiments.run.results import Results
-from coim.experiments.train import main
 from coim.run_folder import read_config
-from tests.experiments.test_train import tiny
 
 FSYNC = os.fsync
 
@@ -90,7 +88,7 @@ def test_a_run_goes_on_there_and_is_the_same_run(
 ) -> None:
     monkeypatch.setattr("fcntl.flock", failing_with(errno.ENOLCK))
     monkeypatch.setattr("os.fsync", fsync_of_files_only(errno.EINVAL))
-    folder = run(tmp_path / "run")
+    folder = run(tmp_path / "run", page=True)
     assert len(capsys.readouterr().err.splitlines()) == 2
     assert soak.differences(whole, folder) == []
     assert (folder / "report.html").is_file()
@@ -211,7 +209,7 @@ def test_a_disk_that_is_full_when_the_page_is_written_does_not_cost_the_run(
     with monkeypatch.context() as patched:
         patched.setattr("coim.experiments.train.write_report", write_on_a_full_disk)
         with pytest.raises(OSError, match=rf"disk full: .*coim report {folder}"):
-            run(folder)
+            run(folder, page=True)
     assert soak.differences(whole, folder) == []
 
 
@@ -226,7 +224,7 @@ def test_a_folder_whose_name_is_not_utf_8_has_a_run_a_page_and_a_comparison(
     printed = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(printed, encoding="utf-8", errors="strict", write_through=True))
     for folder in folders:
-        main(HopperMorph, "hopper", tiny("--out", str(folder), "--num-designs", "1"))
+        run_by_options(folder, "--num-designs", "1", page=True)
     report.main([str(folder) for folder in folders] + ["--out", str(tmp_path / "both.html")])
     for page in (folders[0] / "report.html", tmp_path / "both.html"):
         assert "M\ufffdnner" in page.read_text(encoding="utf-8")

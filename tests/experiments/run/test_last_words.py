@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import tyro
-from interrupted_runs import TINY, run
+from tiny_runs import TINY, run, without_page
 
 from coim import HopperMorph, load_run
 from coim.experiments.commands.watch import Watch
@@ -61,7 +61,8 @@ def test_the_end_of_a_run_names_the_best_body_and_how_to_film_and_retrain_it(
     (chosen,) = choose(load_run(asked.folder), asked.design, asked.run)
     assert chosen.number == best.number
 
-    main(HopperMorph, "hopper", [*words(anew, "coim run hopper"), "--out", "alone", "--quiet"])
+    with without_page():
+        main(HopperMorph, "hopper", [*words(anew, "coim run hopper"), "--out", "alone", "--quiet"])
     (alone,) = load_run("alone").designs
     assert alone.design.tolist() == best.design.tolist()
     assert load_run("alone").ensemble is None

@@ -9,8 +9,9 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
-from interrupted_runs import cut, resume
-from interrupted_runs import run as run_tiny
+from interrupted_runs import cut
+from tiny_runs import resume
+from tiny_runs import run as run_tiny
 
 from benchmarks import soak
 from coim import DynamicsLearner, HopperMorph, SACLearner, load_run
@@ -84,11 +85,11 @@ def test_a_diverged_run_is_told_and_the_page_shows_it(
     assert shown.err.count("warning: run 1 diverged at design 2, episode 1") == 1
     assert "2 of 3 run(s) go on" in shown.err
     assert shown.out == ""
-    page = check(folder / "report.html")
+    page = check(write_report([folder]))
     assert "run 1 diverged at design 2, episode 1: its losses or weights" in page.words
     assert "diverged at" in page.words
     assert "all 4 designs are done" in page.words
-    assert "diverged at" not in check(healthy / "report.html").words
+    assert "diverged at" not in check(write_report([healthy])).words
     both = check(write_report([healthy, folder], out=tmp_path / "both.html"))
     assert both.words.count("diverged at") == 1
     assert "<td>0</td></tr>\n" in (tmp_path / "both.html").read_text()
@@ -146,7 +147,7 @@ def test_when_no_run_is_left_it_ends_by_itself_and_has_a_page(
     assert [row["diverged"] for row in read(folder / "designs.csv")] == [""] * num_runs + [
         "design 2, episode 1"
     ] * num_runs
-    assert "every run has diverged, the last at design 2, episode 1" in check(folder / "report.html").words
+    assert "every run has diverged, the last at design 2, episode 1" in check(write_report([folder])).words
     before = [(folder / name).read_text() for name in ("evaluations.csv", "metrics.csv")]
     resume(folder, "--num-designs", "9")
     assert [(folder / name).read_text() for name in ("evaluations.csv", "metrics.csv")] == before
@@ -161,6 +162,7 @@ def test_an_ensemble_that_diverges_ends_its_run_too(tmp_path: Path, monkeypatch:
     assert read(folder / "metrics.csv")[0]["model/loss_dynamics"] == "inf"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_simulation_that_breaks_is_told_and_the_run_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,4 +186,4 @@ def test_a_simulation_that_breaks_is_told_and_the_run_goes_on(
     assert [row["broken"] for row in rows] == ["0"] * 4 + ["1"] + ["0"] * (len(rows) - 5)
     assert len(read(folder / "designs.csv")) == 4 * 3
     assert all(torch.tensor(float(row["return"])).isfinite() for row in read(folder / "evaluations.csv"))
-    assert "1 simulation(s) broke" in check(folder / "report.html").words
+    assert "1 simulation(s) broke" in check(write_report([folder])).words

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from interrupted_runs import resume, run
+from tiny_runs import resume, run
 
 from benchmarks import soak
 from coim import HopperMorph

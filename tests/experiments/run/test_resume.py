@@ -14,7 +14,8 @@ from threading import Thread
 
 import pytest
 import torch
-from interrupted_runs import cut, resume, run
+from interrupted_runs import cut
+from tiny_runs import resume, run
 
 from benchmarks import soak
 from coim import HopperMorph, load_run
@@ -65,7 +66,7 @@ def test_a_table_that_cannot_be_read_at_the_end_is_refused_at_the_start(tmp_path
     table = folder / "designs.csv"
     table.write_text(table.read_text().replace(",first,1,", ",first,abc,"))
     with pytest.raises(SystemExit, match=r"designs\.csv, line 2: found 'abc' in column xi_torso, expected a number"):
-        resume(folder)
+        resume(folder, page=True)
     assert not (folder / "report.html").exists()
     assert len((folder / "evaluations.csv").read_text().splitlines()) == 1 + 4
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from interrupted_runs import cut, run
+from interrupted_runs import cut
+from tiny_runs import run
 
 import coim.experiments.train
 from coim import CoAdaptation, load_run, run_episode, select_run

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 import torch
-from interrupted_runs import cut, resume, run
+from interrupted_runs import cut
+from tiny_runs import resume, run
 
 from coim import EpisodeDone
 from coim.experiments.run.results import Results

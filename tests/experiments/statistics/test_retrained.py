@@ -73,6 +73,7 @@ def test_boxes_are_quartiles_and_points_are_the_best_returns_of_the_retrained_de
     assert {y for y, other in flat if y == other} == {1, 3, 2, 8}  # whiskers end at the last design
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_figure_2_and_its_tests_are_written_with_their_numbers(tmp_path: Path) -> None:
     lines = write_retrained(tmp_path, {"none": of_seeds(1, 2, 3), "known": of_seeds(2, 4, 6, 8)})
     list_designs(tmp_path, [*lines, lines[0] | {"folder": "not-yet", "arm": "known"}])

@@ -23,6 +23,7 @@ MADE_UP = Arm(
 )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_one_entry_is_enough_for_study_statistics_and_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ARMS, "made-up", MADE_UP)
     study = Study(

@@ -8,7 +8,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from interrupted_runs import TINY, cut, resume
+from interrupted_runs import cut
+from tiny_runs import TINY, resume
 
 from coim import EpisodeDone
 from coim.envs import BODIES

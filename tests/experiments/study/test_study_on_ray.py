@@ -1,4 +1,7 @@
-"""Studies on a real Ray of this machine: a cluster whose head computes nothing, and `coim study` alone."""
+"""Studies and retrainings on a real Ray of this machine: a cluster whose head computes nothing, and one for a command.
+
+All of them are here, so that one process starts Ray where several share the tests.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,13 @@ from typing import Any
 
 import pytest
 import torch
+from tiny_runs import OPTIONS, run_by_options, without_page
 
 from benchmarks.soak import differences
 from coim import HopperMorph
+from coim.experiments.commands.retrain import main as retrain
 from coim.experiments.commands.study import main as entry
+from coim.experiments.figures.write import write_figures
 from coim.experiments.study import cluster as cluster_module
 from coim.experiments.study.cluster import (
     LONGEST,
@@ -102,13 +108,12 @@ def test_every_cell_of_a_study_is_an_ordinary_run_and_pairs_share_their_first_de
 
 @pytest.mark.usefixtures("cluster")
 def test_a_cell_whose_process_is_killed_goes_on_from_its_checkpoint_to_the_same_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     what, cell = study(arms=("known",), overrides=SLOWER), "hopper-forward-known-0"
-    monkeypatch.setattr("coim.experiments.train.draw_run", lambda folder, body: folder)
-    monkeypatch.setattr("coim.experiments.train.write_report", lambda folders, body: folders[0])
     peace = tmp_path / "peace" / "cells" / cell
-    run_recipe(HopperMorph, "hopper", dataclasses.replace(what.cells()[0].settings, out=peace, threads=1))
+    with without_page():
+        run_recipe(HopperMorph, "hopper", dataclasses.replace(what.cells()[0].settings, out=peace, threads=1))
     killing = meanwhile(tmp_path / "killed", cell, rows=3, act=lambda pid: os.kill(pid, signal.SIGKILL))
     failed, ledger = conduct(tmp_path / "killed", what)
     killing.join()
@@ -210,6 +215,42 @@ def test_a_study_that_is_told_to_end_stops_at_once_and_goes_on_by_the_line_it_pr
     entry(told[8:])
     assert [(row.state, row.tries) for row in read_ledger(folder / "ledger.csv")] == [("finished", 2), ("finished", 1)]
     assert [len(read(folder / "cells" / cell / "evaluations.csv")) for cell in cells] == [7, 1]
+
+
+@pytest.mark.usefixtures("cluster", "undrawn")
+def test_designs_are_retrained_once_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "coim.experiments.commands.retrain.ray_running", lambda *_, **__: contextlib.nullcontext()
+    )  # on the cluster there is
+    for arm in ("none", "known"):
+        run_by_options(tmp_path / "cells" / f"hopper-forward-{arm}-0", "--imagine", arm, "--quiet")
+    with pytest.raises(SystemExit, match=r"no node has 1 cores and 0.5 of a GPU here; ask for less"):
+        retrain([str(tmp_path), "--episodes", "2", "--gpus", "0.5"])
+    capsys.readouterr()
+    retrain([str(tmp_path), "--episodes", "2", "--workers", "1"])
+    said = capsys.readouterr().out
+    assert "2 of 2 designs to train" in said
+    assert "\n2 training episodes on each\n" in said
+    chosen = read(tmp_path / "retrained" / "designs.csv")
+    for line in chosen:
+        cell = tmp_path / "cells" / line["cell"]
+        found = next(row for row in read(cell / "designs.csv") if row["kind"] == "optimised")
+        episodes = read(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert [row["kind"] for row in episodes] == ["first", "first"]
+        assert [row["episode"] for row in episodes] == ["1", "2"]
+        assert all(row[name] == found[name] for row in episodes for name in XI)
+    retrain([str(tmp_path), "--episodes", "2", "--workers", "1"])
+    assert "0 of 2 designs to train" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"made with other settings: first_episodes \(2 to 3\)"):
+        retrain([str(tmp_path), "--episodes", "3"])
+    write_figures(tmp_path)
+    rows = read(tmp_path / "figures" / "figure_2_retrained.csv")
+    for row, line in zip(rows, chosen, strict=True):
+        own = read(tmp_path / "retrained" / "cells" / line["folder"] / "evaluations.csv")
+        assert float(row["best_return"]) == max(float(episode["return"]) for episode in own)
+        assert (row["episodes"], row["study_episodes"]) == ("2", OPTIONS[OPTIONS.index("--episodes") + 1])
 
 
 def test_paths_of_sockets_are_short_enough_everywhere(cluster: Any) -> None:
