@@ -1,4 +1,4 @@
-"""Fig. 2: returns of the best designs that Eq. 5 chose in each arm, retrained from scratch, and tests between arms."""
+"""Fig. 2: returns of the best designs of each arm, retrained from scratch, and tests between arms."""
 
 from __future__ import annotations
 
@@ -128,8 +128,8 @@ def draw_designs(rows: pd.DataFrame, notes: Sequence[str]) -> Plot:
         draw_boxes(axes, {arm: rows["best_return"].to_numpy() for arm, rows in own.items()})
         axes.set(title=", ".join(place), ylabel="best return, retrained from scratch (1)")
     caption = (
-        "Highest return on the best designs that Eq. 5 chose in each run, after training plain SAC on each of them "
-        "from scratch. Points: designs. Boxes: quartiles and median. Whiskers: all designs."
+        "Highest return on the best designs of each run, after training plain SAC on each of them from scratch. "
+        "Points: designs. Boxes: quartiles and median. Whiskers: all designs."
     )
     return Plot(name=DESIGNS, figure=figure, rows=rows_of(rows), caption=caption, notes=notes)
 
