@@ -1,7 +1,8 @@
 """Co-imagination of behaviour and morphology: components that improve a robot's body and controller together.
 
 Everything that is public, in one flat list. Importing it starts nothing, reads nothing and prints nothing. A name is
-imported when it is first asked for: losses and networks work where mujoco and pyswarms are not installed.
+imported when it is first asked for: losses and networks work where mujoco and pyswarms are not installed. Gymnasium
+knows the bodies, such as ``coim/Hopper-v0``, when both are imported, in either order.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 # First, before TorchRL imports mujoco itself: a missing OpenGL library is then said in one sentence.
-import coim.envs  # noqa: F401
-from coim.lazy import lazy_names
+import coim.envs
+import coim.envs.gymnasium_ids
+from coim.lazy import lazy_names, when_imported
 
 if TYPE_CHECKING:
     from coim.batches import batch_parts, sample_batches, sample_mixture
@@ -28,7 +30,15 @@ if TYPE_CHECKING:
         RandomDesigns,
         TrustRegion,
     )
-    from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, SimulatorDynamics, WalkerMorph, WorldModelEnv
+    from coim.envs import (
+        GymnasiumEnv,
+        HalfCheetahMorph,
+        HopperMorph,
+        MorphEnv,
+        SimulatorDynamics,
+        WalkerMorph,
+        WorldModelEnv,
+    )
     from coim.episode import run_episode
     from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
     from coim.governor import Governor
@@ -72,6 +82,7 @@ else:
             ],
             "learners.dynamics": ["DynamicsLearner"],
             "envs": [
+                "GymnasiumEnv",
                 "HalfCheetahMorph",
                 "HopperMorph",
                 "MorphEnv",
@@ -102,6 +113,8 @@ else:
         },
     )
 
+when_imported("gymnasium", lambda: coim.envs.gymnasium_ids.register_bodies(coim.envs.__all__))
+
 __version__ = "0.2.0"
 
 __all__ = [
@@ -123,6 +136,7 @@ __all__ = [
     "GaussianEnsemble",
     "Governor",
     "GradientSearch",
+    "GymnasiumEnv",
     "HalfCheetahMorph",
     "HopperMorph",
     "ImaginedReplay",

@@ -1,9 +1,10 @@
-"""Names of a package whose modules are imported when they are first asked for.
+"""Names of a package whose modules are imported when they are first asked for, and calls that wait for an import.
 
 Losses and networks can be lifted out where mujoco or pyswarms is not installed: only what needs them imports them.
 
 References:
     PEP 562: Module ``__getattr__`` and ``__dir__``, https://peps.python.org/pep-0562.
+    PEP 302: New import hooks, https://peps.python.org/pep-0302.
 """
 
 from __future__ import annotations
@@ -11,7 +12,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 
@@ -47,3 +51,41 @@ def lazy_names(
         return sorted({*vars(sys.modules[package]), *home_of})
 
     return getattribute, directory
+
+
+def when_imported(module: str, call: Callable[[], None]) -> None:
+    """Call once a module has been imported: at once if it is already, and never if it never is.
+
+    Args:
+        module: name of a module without a dot, such as ``"gymnasium"``.
+        call: what to call then. What it raises, the import raises.
+    """
+    if sys.modules.get(module) is not None:
+        call()
+    elif module not in sys.modules:  # None there forbids its import
+        sys.meta_path.insert(0, _Waiting(module, call))
+
+
+class _Waiting(MetaPathFinder):
+    """Finds one module as all other finders do, and calls a function behind its import; then it is gone."""
+
+    def __init__(self, module: str, call: Callable[[], None]) -> None:
+        self._module, self._call = module, call
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """The module's spec with a loader that calls the function; None for every other module."""
+        if fullname != self._module:
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(fullname)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def exec_module(module: ModuleType) -> None:
+                execute(module)
+                self._call()
+
+            spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec

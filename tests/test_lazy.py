@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import coim
+from coim.lazy import when_imported
 
 PACKAGES = pytest.mark.parametrize("package", ["coim", "coim.designs", "coim.envs"])
 WITHOUT = "import sys; sys.modules.update(mujoco=None, pyswarms=None, gymnasium=None)\n"
@@ -70,3 +71,28 @@ def test_modules_are_found_by_their_names_as_if_the_package_had_imported_them() 
         check=True,
     )
     assert result.stdout.split() == [coim.products.__name__, "coim.envs.task"]
+
+
+def test_gymnasium_knows_the_bodies_in_either_order_and_is_not_imported_for_it() -> None:
+    lines = ["import sys, coim", "assert not {'gymnasium', 'torch'} & sys.modules.keys()", "import gymnasium"]
+    lines += ["known = [name for name in gymnasium.registry if name.startswith('coim/')]"]
+    lines += ["assert 'torch' not in sys.modules", "for name in known: del gymnasium.registry[name]"]
+    lines += ["del sys.modules['coim']", "import coim"]
+    lines += ["assert known == [name for name in gymnasium.registry if name.startswith('coim/')]", "print(*known)"]
+    result = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    assert "coim/Hopper-v0" in result.stdout.split()
+
+
+def test_a_call_waits_for_its_module_and_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "made_up_module.py").write_text("value = 1")
+    monkeypatch.syspath_prepend(tmp_path)
+    finders, seen = list(sys.meta_path), []
+    when_imported("made_up_module", lambda: seen.append(sys.modules["made_up_module"].value))
+    assert importlib.import_module("json") is not None
+    assert seen == []
+    importlib.reload(importlib.import_module("made_up_module"))
+    assert (seen, sys.meta_path) == ([1], finders)
+    when_imported("made_up_module", lambda: seen.append(2))  # it is there already
+    monkeypatch.setitem(sys.modules, "made_up_module", None)  # and now it is forbidden
+    when_imported("made_up_module", lambda: seen.append(3))
+    assert (seen, sys.meta_path) == ([1, 2], finders)

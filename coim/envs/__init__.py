@@ -19,6 +19,7 @@ except AttributeError as error:  # what PyOpenGL raises if the library of MUJOCO
 
 if TYPE_CHECKING:
     from .bodies import BODIES
+    from .gymnasium_env import GymnasiumEnv
     from .half_cheetah import HalfCheetahMorph
     from .hopper import HopperMorph
     from .morph import MorphEnv
@@ -30,6 +31,7 @@ else:
         __name__,
         {
             "bodies": ["BODIES"],
+            "gymnasium_env": ["GymnasiumEnv"],
             "half_cheetah": ["HalfCheetahMorph"],
             "hopper": ["HopperMorph"],
             "morph": ["MorphEnv"],
@@ -39,4 +41,13 @@ else:
         },
     )
 
-__all__ = ["BODIES", "HalfCheetahMorph", "HopperMorph", "MorphEnv", "SimulatorDynamics", "WalkerMorph", "WorldModelEnv"]
+__all__ = [
+    "BODIES",
+    "GymnasiumEnv",
+    "HalfCheetahMorph",
+    "HopperMorph",
+    "MorphEnv",
+    "SimulatorDynamics",
+    "WalkerMorph",
+    "WorldModelEnv",
+]

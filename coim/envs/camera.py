@@ -43,7 +43,7 @@ class Camera:
 
     def __init__(self, spec: mujoco.MjSpec, *, width: int, height: int, root: Root, name: str | None = None) -> None:
         self._travelled = root.unseen
-        self._model = _dress(spec, width, height).compile()
+        self._model = dress(spec, width, height).compile()
         self._data = mujoco.MjData(self._model)
         self._view = mujoco.MjvCamera()
         mujoco.mjv_defaultFreeCamera(self._model, self._view)
@@ -86,7 +86,7 @@ class Camera:
         self.close()
 
 
-def _dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
+def dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
     """Return a copy with a sky, a floor of 1 m squares, and an off-screen buffer of the size of the picture."""
     spec = spec.copy()
     floor = find_floor(spec.compile())

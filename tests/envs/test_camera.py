@@ -9,7 +9,7 @@ import sys
 PICTURES = """
 import numpy as np, torch
 from tensordict import TensorDict
-from coim.envs import HopperMorph
+from coim.envs import GymnasiumEnv, HopperMorph
 env = HopperMorph(num_runs=2, seed=0)
 env.reset(TensorDict({"design": torch.tensor([[0.5] * 4, [2.0] * 4])}, [2]))
 try:
@@ -27,6 +27,15 @@ else:
         assert camera._model.vis.quality.shadowsize == 1024  # 4096 would double what a picture takes
     here, half, far, before, after = pictures
     assert (here == small).all()
+    gym = GymnasiumEnv("HopperMorph", design=[0.5] * 4, reset_noise=0.0, render_mode="rgb_array", width=160, height=120)
+    gym.reset()
+    short = gym.render()
+    gym.reset(options={"design": [2.0] * 4})
+    grown = gym.render()
+    gym.close()
+    assert short.shape == (120, 160, 3) and short.dtype == np.uint8
+    assert (short != grown).any()
+    assert (grown == gym.bodies.render(width=160, height=120)).all()
     print("CHANGE", *(int(np.abs(a - b).sum()) for a, b in ((here, half), (here, far), (before, after))))
 """
 

@@ -1,0 +1,75 @@
+"""A window that shows a body while it moves: MuJoCo's own viewer, which the mouse turns and zooms."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+
+import mujoco
+import numpy as np
+
+from coim.envs.camera import PERIOD, dress
+from coim.envs.root import Root
+
+SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display, on Linux
+PICTURE = 480  # pixels along a side of the off-screen buffer, which a window does not use
+
+
+class Window:
+    """A window with one body, in real time. After its user has closed it, nothing more is shown.
+
+    Args:
+        spec: the body; it is not changed.
+        root: how the body moves.
+        step_seconds: simulated time between two poses, s.
+
+    Raises:
+        RuntimeError: if there is no display; see `refuse_without_display`.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, *, root: Root, step_seconds: float) -> None:
+        refuse_without_display()
+        from mujoco import viewer  # opens the window system, which a machine without a display does not have
+
+        self._travelled, self._step_seconds, self._due = root.unseen, step_seconds, time.monotonic()
+        self._model = dress(spec, PICTURE, PICTURE).compile()
+        self._data = mujoco.MjData(self._model)
+        self._handle = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        with self._handle.lock():
+            mujoco.mjv_defaultFreeCamera(self._model, self._handle.cam)
+            self._handle.cam.azimuth, self._handle.cam.elevation = 90.0, -8.0 if root.kind == "planar" else -25.0
+
+    def show(self, qpos: np.ndarray) -> None:
+        """Show a pose when its time has come.
+
+        Args:
+            qpos: joint positions, ``[nq]``; the first ones are the place on the ground in m.
+        """
+        if not self._handle.is_running():
+            return
+        with self._handle.lock():
+            self._data.qpos[:] = qpos
+            for axis in range(self._travelled):  # as in `Camera.photograph`
+                self._data.qpos[axis] = self._handle.cam.lookat[axis] = qpos[axis] % PERIOD
+            mujoco.mj_forward(self._model, self._data)
+        self._handle.sync()
+        self._due = max(self._due + self._step_seconds, time.monotonic())
+        time.sleep(max(0.0, self._due - time.monotonic()))
+
+    def close(self) -> None:
+        """Close the window."""
+        self._handle.close()
+
+
+def refuse_without_display() -> None:
+    """Refuse a window where none can be opened.
+
+    Raises:
+        RuntimeError: if no display is named, on Linux; elsewhere there always is one.
+    """
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in SCREENS):
+        raise RuntimeError(
+            f"a window needs a display, and none of {', '.join(SCREENS)} names one: take render_mode='rgb_array', "
+            "which draws without one, or start it under a display such as xvfb-run"
+        )
