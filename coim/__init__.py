@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from coim.objectives import CoImSACLoss, DesignValue, EnsembleNLLLoss
     from coim.posterior_choice import PosteriorChoice
     from coim.run_folder import TriedDesign
-    from coim.saved_run import Agent, SavedRun, load_run
+    from coim.saved_run import Agent, SavedRun, TrainedBody, load_run
     from coim.updates import UpdatePlan
 else:
     __getattr__, __dir__ = lazy_names(
@@ -107,7 +107,7 @@ else:
                 "select_run",
             ],
             "objectives": ["CoImSACLoss", "DesignValue", "EnsembleNLLLoss"],
-            "saved_run": ["Agent", "SavedRun", "TriedDesign", "load_run"],
+            "saved_run": ["Agent", "SavedRun", "TrainedBody", "TriedDesign", "load_run"],
             "posterior_choice": ["PosteriorChoice"],
             "updates": ["UpdatePlan"],
         },
@@ -154,6 +154,7 @@ __all__ = [
     "SimulatorDynamics",
     "Situation",
     "StackedMLP",
+    "TrainedBody",
     "TransitionBuffer",
     "TriedDesign",
     "TrustRegion",

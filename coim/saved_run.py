@@ -5,6 +5,7 @@ Shapes: T steps, K runs, D design.
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,19 @@ class Agent:
 
 
 @dataclass(frozen=True, eq=False)
+class TrainedBody:
+    """A body that a run has tried, with the policy of its best evaluation.
+
+    Attributes:
+        tried: the design ``[D]``, its number, and the return of that evaluation.
+        policy: the individual policy that earned it, of one run.
+    """
+
+    tried: TriedDesign
+    policy: Policy
+
+
+@dataclass(frozen=True, eq=False)
 class SavedRun:
     """What became of a run, as `load_run` returns it.
 
@@ -63,6 +77,47 @@ class SavedRun:
     ensemble: GaussianEnsemble | None
     designs: tuple[TriedDesign, ...]
     run: int | None
+
+    @property
+    def best(self) -> TrainedBody:
+        """The design with the highest return, of all runs in the folder, with its policy.
+
+        Raises:
+            ValueError: if no design has a return yet, or its policy was not kept.
+
+        Example:
+            >>> best = load_run("runs/hopper-20260101-120000-run").best  # doctest: +SKIP
+            >>> best.tried.design, best.policy  # doctest: +SKIP
+        """
+        return self.trained()
+
+    def trained(self, number: int | None = None) -> TrainedBody:
+        """A design of the run with its policy; of K runs, that of the run with the highest return on it.
+
+        Args:
+            number: of the design, from 1; None takes the one with the highest return.
+
+        Raises:
+            ValueError: if no such design has a return, or its policy was not kept.
+        """
+        best = self.highest(number)
+        policy = self.policy_of(best.number)
+        return TrainedBody(best, policy if policy.num_runs is None else select_run(policy, best.run))
+
+    def highest(self, number: int | None = None) -> TriedDesign:
+        """The design with the highest return, or that of a number in the run with the highest return on it.
+
+        Raises:
+            ValueError: if no such design has a return.
+        """
+        done = [tried for tried in self.designs if math.isfinite(tried.best_return)]
+        if not done:
+            raise ValueError(f"no design in {self.folder} has a return yet; wait for the next row of its designs.csv")
+        asked = [tried for tried in done if number in (None, tried.number)]
+        if not asked:
+            there = sorted({tried.number for tried in done})
+            raise ValueError(f"{self.folder} has no design {number} with a return: there are designs {there}")
+        return max(asked, key=lambda tried: tried.best_return)
 
     def policy_of(self, number: int) -> Policy:
         """The individual policy to which a design owes its best return.

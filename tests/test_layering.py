@@ -26,6 +26,7 @@ RANKS |= {"experiments": 3}
 HOMES = {"mujoco": "envs", "gymnasium": "envs", "pyswarms": "designs"}
 HOMES |= {name: "designs" for name in ("botorch", "gpytorch", "linear_operator")}
 OF_EXPERIMENTS = ("wandb", "tyro", "matplotlib", "imageio", "jinja2", "argparse", "ray", "pandas", "pydantic")
+OF_EXPERIMENTS += ("onnx", "onnxruntime", "safetensors")
 HOMES |= dict.fromkeys(OF_EXPERIMENTS, "experiments")
 REFUSED = {"utils", "common", "core", "helpers", "misc", "trainers"}
 DYNAMIC_IMPORTS = {"importlib.import_module", "import_module", "__import__"}

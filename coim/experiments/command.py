@@ -16,6 +16,8 @@ COMMANDS = {
     "study": "compute many runs that are compared",
     "report": "write the page of a run, or of several side by side",
     "watch": "film a run's policies on its bodies",
+    "evaluate": "run a policy for some episodes: mean, spread, and a CSV file",
+    "export": "write a policy and its body for other programs",
     "figures": "draw the figures of a study",
     "retrain": "train the best bodies of a study again from scratch",
     "archive": "copy the tables of a study, without its checkpoints",

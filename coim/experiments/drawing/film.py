@@ -17,16 +17,16 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDict
 
-from coim.envs import BODIES, MorphEnv
+from coim.envs import MorphEnv
 from coim.envs.camera import Camera
 from coim.episode import run_episode
 from coim.experiments.run.atomic_write import naming_out, written_aside
-from coim.experiments.run.bodies import imported_body
+from coim.experiments.run.bodies import opened
 from coim.experiments.run.last_words import in_names
 from coim.experiments.run.progress import counted
 from coim.experiments.run.records import number
-from coim.run_folder import TriedDesign, policy_path, read_config
-from coim.saved_run import SavedRun, load_run
+from coim.run_folder import TriedDesign, policy_path
+from coim.saved_run import SavedRun
 
 PolicyName = Literal["best", "population"]
 
@@ -132,21 +132,6 @@ def film(
         path = (out or folder / "videos") / f"{'-'.join(words)}.mp4"
         write_film(path, [take(loaded, tried, policy, width, height) for tried in designs])
         yield path
-
-
-def opened(folder: Path, body: str | None) -> SavedRun:
-    """Open a run folder.
-
-    Raises:
-        ValueError: if its body is unknown; the message names the option that says which class it is.
-    """
-    environment = read_config(folder)["environment"]
-    if body is None and environment not in BODIES:
-        raise ValueError(
-            f"{folder} holds a run of {environment!r}, which is none of {', '.join(BODIES)}; name the class of its "
-            "body with --body module:Class"
-        )
-    return load_run(folder, body=imported_body(body))
 
 
 def refuse_lost_policies(folder: Path, chosen: Sequence[TriedDesign]) -> None:

@@ -1,10 +1,13 @@
-"""A body that is none of the three, by the name of its class on a command line."""
+"""The body of a run, also one that is none of ours, by the name of its class on a command line."""
 
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 
-from coim.envs import MorphEnv
+from coim.envs import BODIES, MorphEnv
+from coim.run_folder import read_config
+from coim.saved_run import SavedRun, load_run
 
 
 def imported_body(name: str | None) -> type[MorphEnv] | None:
@@ -37,3 +40,23 @@ def imported_body(name: str | None) -> type[MorphEnv] | None:
     if not (isinstance(body, type) and issubclass(body, MorphEnv)):
         raise ValueError(f"--body {name} is no body: name a class that is derived from coim.MorphEnv")
     return body
+
+
+def opened(folder: Path, body: str | None, *, run: int | None = None) -> SavedRun:
+    """Open a run folder.
+
+    Args:
+        folder: of the run.
+        body: class of the body as ``module:Class``; None takes the one that the run's environment names.
+        run: one of K runs; None takes all.
+
+    Raises:
+        ValueError: if its body is unknown; the message names the option that says which class it is.
+    """
+    environment = read_config(folder)["environment"]
+    if body is None and environment not in BODIES:
+        raise ValueError(
+            f"{folder} holds a run of {environment!r}, which is none of {', '.join(BODIES)}; name the class of its "
+            "body with --body module:Class"
+        )
+    return load_run(folder, run=run, body=imported_body(body))
