@@ -41,8 +41,8 @@ from coim.experiments.run.machine import (
 from coim.experiments.run.progress import Progress
 from coim.experiments.run.results import Results, folder_of
 from coim.experiments.run.resume import begin_or_resume
+from coim.experiments.run.run_log import FORMERLY, RunLog
 from coim.experiments.run.settings import QUICK, Settings
-from coim.experiments.run.wandb_log import WandbLog
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
@@ -147,7 +147,8 @@ def follow(algorithm: Followed, folder: Path, name: str, settings: Settings) -> 
         best=None if trial is None else trial.best,
         quiet=settings.quiet,
     )
-    log = None if settings.wandb == "off" else WandbLog(folder, name, settings.wandb, names, quiet=settings.quiet)
+    kind = settings.log if settings.log != "off" else FORMERLY[settings.wandb]
+    log = None if kind == "off" else RunLog(folder, name, kind, names, quiet=settings.quiet)
     started = time.perf_counter()
     for event in algorithm:
         results.write(event, time.perf_counter() - started)

@@ -26,7 +26,11 @@ OPTIONAL = {
     "scipy": "no intervals in figures and tables",
     "imageio-ffmpeg": "no films",
     "ray": "no studies",
-    "wandb": "--wandb has nothing to log with",
+    "wandb": "--log wandb has nothing to log with",
+    "tensorboard": "--log tensorboard has nothing to log with",
+    "trackio": "--log trackio has nothing to log with",
+    "onnxruntime": "coim export writes no ONNX",
+    "safetensors": "coim export writes no safetensors",
 }
 SEEN = "/proc/cpuinfo"  # Linux
 # Draws one picture in a process of its own: MuJoCo reads MUJOCO_GL once, and a broken driver can end the process.

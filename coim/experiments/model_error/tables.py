@@ -47,7 +47,7 @@ CHANGES = Layout(  # beside it; and two columns of the change by each model and 
     grows=False,
 )
 LAST = 0.25  # share of the training steps that numbers in a caption are of
-PLACES = ("seed", "num_runs", "name", "out", "resume", "wandb", "quiet", "threads", "checkpoint_every")
+PLACES = ("seed", "num_runs", "name", "out", "resume", "log", "wandb", "quiet", "threads", "checkpoint_every")
 MEASUREMENT = ["run", "env_steps", "probe"]  # columns that name one measurement of several models in a folder
 
 

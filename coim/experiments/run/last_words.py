@@ -28,7 +28,7 @@ def plain_sac(settings: Settings, design: Sequence[float], **changed: Any) -> Se
     alone: dict[str, Any] = {"imagine": "none", "dream": "ensemble", "bodies": "search", "num_designs": 1}
     alone |= {"num_runs": 1, "population_updates": 0, "model_updates": 0}
     alone |= {"individual_mix": 0.0, "individual_imagined_share": 0.0}
-    alone |= {"out": None, "resume": None, "name": "retrained", "wandb": "off"}
+    alone |= {"out": None, "resume": None, "name": "retrained", "log": "off", "wandb": "off"}
     return dataclasses.replace(settings, first_design=tuple(design), **alone | changed)
 
 

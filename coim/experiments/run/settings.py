@@ -160,8 +160,10 @@ class Settings:
     """Episodes between two checkpoints."""
     name: str = "run"
     """Last part of the name of the default folder."""
+    log: Literal["off", "tensorboard", "trackio", "wandb", "wandb-offline"] = "off"
+    """Also send the numbers of the CSV files to TensorBoard, trackio or Weights & Biases; wandb needs an account."""
     wandb: Literal["off", "offline", "online"] = "off"
-    """Also send the numbers of the CSV files to Weights & Biases."""
+    """The former name of --log wandb (online) and --log wandb-offline (offline)."""
     quiet: bool = False
     """Print errors only."""
 

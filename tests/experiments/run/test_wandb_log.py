@@ -1,4 +1,4 @@
-"""Weights & Biases fails, asks or dies, and the run goes on; a resumed run goes on in the W&B run that it had."""
+"""TensorBoard and trackio get every number; Weights & Biases may fail, ask or die; a resumed run goes on in its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import json
 import os
 import signal
 import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +19,7 @@ from tiny_runs import resume, run
 
 from coim import EpisodeDone
 from coim.experiments.run.results import Results
-from coim.experiments.run.wandb_log import scalars
+from coim.experiments.run.run_log import RunLog, scalars
 
 SMALL = {"num_designs": 2, "episodes": 1}
 
@@ -45,6 +47,60 @@ def test_series_have_the_names_of_the_columns() -> None:
     )
     found = scalars(event, ["xi_torso", "xi_foot"])
     assert (found["run 0/xi_foot"], found["run 1/xi_torso"]) == (1.5, 0.5)
+
+
+def episode(number: int, **changed: Any) -> EpisodeDone:
+    return EpisodeDone(
+        **{
+            "index": 0, "kind": "first", "episode": number, "design": torch.ones(1, 2), "imagined": 0,
+            "training_return": torch.zeros(1), "evaluation_return": torch.tensor([float(number)]),
+            "env_steps": 10 * (number + 1), "metrics": {}, "seconds": {"search": 2.0}, **changed,
+        }
+    )  # fmt: skip
+
+
+def logged(folder: Path, kind: Any) -> None:
+    """Two episodes, the second of which has diverged, by the call that every logger has."""
+    (folder / "config.json").write_text(json.dumps({"environment": "hopper", "settings": {}}))
+    log = RunLog(folder, "hopper", kind, ["torso", "foot"])
+    log.write(episode(0))
+    log.write(episode(1, diverged={0: (0, 1)}))
+    log.close()
+
+
+def test_tensorboard_has_every_number_over_training_steps(tmp_path: Path) -> None:
+    reading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    logged(tmp_path, "tensorboard")
+    found = reading.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(point.step, point.value) for point in found.Scalars("seconds/search")] == [(10, 2.0), (20, 2.0)]
+    assert [(point.step, point.value) for point in found.Scalars("run 0/return")] == [(10, 0.0), (20, 1.0)]
+    assert [(point.step, point.value) for point in found.Scalars("run 0/diverged")] == [(20, 1.0)]
+
+
+def test_trackio_gets_every_number_of_a_run_that_it_can_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Any] = []
+    experiment = SimpleNamespace(
+        log=lambda values, step: told.append((values, step)), finish=lambda: told.append("finished")
+    )
+    begun = SimpleNamespace(init=lambda **options: told.append(options) or experiment)
+    monkeypatch.setitem(sys.modules, "trackio", begun)
+    monkeypatch.setattr("torchrl.record.loggers.trackio._has_trackio", True)
+    logged(tmp_path, "trackio")
+    first, *numbers, last = told
+    assert (first["project"], first["name"], first["resume"]) == ("coim-hopper", tmp_path.name, "allow")
+    assert ({"run 0/return": 0.0}, 10) in numbers
+    assert ({"run 0/diverged": 1.0}, 20) in numbers
+    assert last == "finished"
+
+
+@pytest.mark.parametrize(("kind", "name"), [("tensorboard", "TensorBoard"), ("trackio", "trackio")])
+def test_a_logger_that_is_not_installed_is_said(
+    kind: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = f"torchrl.record.loggers.{kind}"
+    monkeypatch.setattr(f"{home}._has_{'tb' if kind == 'tensorboard' else kind}", False)
+    with pytest.raises(OSError, match=rf"{name} cannot be started \(.*\); pip install {kind} where it is missing"):
+        logged(tmp_path, kind)
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
