@@ -9,6 +9,7 @@ from typing import Any
 from coim.envs import MorphEnv
 from coim.envs.blueprint import motors, observed
 from coim.experiments.export.taken import Taken
+from coim.experiments.run.atomic_write import shortest
 from coim.experiments.run.records import number
 
 HEADING = "# A policy of coim and its body"
@@ -43,7 +44,7 @@ def card(path: Path, taken: Taken, robot: MorphEnv, config: dict[str, Any], *, e
         states: how many random states it is the largest of.
     """
     names, low_high = robot.design_names(), zip(*(end.tolist() for end in robot.design_bounds()))
-    design = [f"{factor:.9g}" for factor in taken.design.tolist()]
+    design = [shortest(factor) for factor in taken.design.tolist()]
     seen, moved = observed(robot), list(motors(robot))
     returned = "none: no design of the run" if taken.tried is None else number(taken.tried.best_return)
     call = CALLS[path.suffix].format(file=path.name, states=len(seen), design=", ".join(design))

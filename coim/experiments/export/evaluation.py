@@ -13,7 +13,7 @@ import torch
 from coim.episode import run_episode
 from coim.experiments.export.taken import Taken
 from coim.experiments.frames import rows_of
-from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole
+from coim.experiments.run.atomic_write import as_csv, naming_out, shortest, write_whole
 from coim.experiments.run.records import number
 from coim.tables import DESIGN_PREFIX, Layout, design_columns
 
@@ -47,7 +47,7 @@ def evaluate(taken: Taken, *, episodes: int, seed: int) -> pd.DataFrame:
         }
     )
     for name, factor in zip(design_columns(bodies.design_names()), taken.design.tolist()):
-        table[name] = factor
+        table[name] = float(shortest(factor))
     return table
 
 

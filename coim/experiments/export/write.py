@@ -12,7 +12,7 @@ from coim.envs.blueprint import lengths, mjcf
 from coim.experiments.export.actor import FORMATS, Actor
 from coim.experiments.export.card import HEADING, card
 from coim.experiments.export.taken import Taken
-from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, written_aside
+from coim.experiments.run.atomic_write import as_csv, naming_out, shortest, write_whole, written_aside
 from coim.models import Policy
 from coim.run_folder import read_config
 
@@ -53,7 +53,7 @@ def export(source: Path, taken: Taken, path: Path) -> list[Path]:
     about = {
         "environment": config["environment"],
         "settings": taken.settings,
-        "design": taken.design.tolist(),
+        "design": [float(shortest(factor)) for factor in taken.design.tolist()],
         "design_names": robot.design_names(),
         "step_seconds": robot.step_seconds,
     }
