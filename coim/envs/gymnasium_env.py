@@ -237,3 +237,18 @@ def body_class(body: type[MorphEnv] | str) -> type[MorphEnv]:
     if not (isinstance(found, type) and issubclass(found, MorphEnv)):
         raise ValueError(f"body is {body!r}, it must be a class derived from MorphEnv or one of {', '.join(ours)}")
     return found
+
+
+def made_by_name(body: type[MorphEnv], **options: Any) -> GymnasiumEnv:
+    """A body's environment that has a ``spec``, from which Gymnasium makes it again; one of another class has none.
+
+    Args:
+        body: its class.
+        options: of `GymnasiumEnv`.
+    """
+    name = f"coim/{body.__name__.removesuffix('Morph')}-v0"
+    if body not in BODIES.values():
+        return GymnasiumEnv(body, **options)
+    made = gymnasium.make(name, **options).unwrapped
+    assert isinstance(made, GymnasiumEnv)
+    return made

@@ -74,16 +74,21 @@ class ReplayFile:
     def read(self, description: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the described rows and go on behind them; later ones are cut off."""
         self.num_rows, self._size, self._layout = (description[key] for key in ("rows", "bytes", "layout"))
-        table = self._bytes(description)
-        self._digest = hashlib.sha256(table.data)
-        rows, start = {}, 0
-        for key, dtype, shape in self._layout:
-            stop = start + np.dtype(dtype).itemsize * int(np.prod(shape))
-            column = np.ascontiguousarray(table.reshape(self.num_rows, -1)[:, start:stop])
-            rows[key] = torch.from_numpy(column.view(dtype).reshape(self.num_rows, *shape))
-            start = stop
+        self._digest = hashlib.sha256(self._bytes(description).data)
+        rows = self.peek(description)
         if self.path.exists():
             os.truncate(self.path, self._size)
+        return rows
+
+    def peek(self, description: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return the described rows ``[T, K, ...]``; the file is not changed, and a run may go on to write it."""
+        table, count = self._bytes(description), description["rows"]
+        rows, start = {}, 0
+        for key, dtype, shape in description["layout"]:
+            stop = start + np.dtype(dtype).itemsize * int(np.prod(shape))
+            column = np.ascontiguousarray(table.reshape(count, -1)[:, start:stop])
+            rows[key] = torch.from_numpy(column.view(dtype).reshape(count, *shape))
+            start = stop
         return rows
 
     def _bytes(self, description: Mapping[str, Any]) -> np.ndarray:
