@@ -21,7 +21,7 @@ from coim.agreement import check_counts, check_transfer, check_words
 from coim.buffers import Buffers
 from coim.designs import DesignSearch, RandomDesigns, TrustRegion
 from coim.designs.search import Fitness
-from coim.designs.trust_region import check_reach
+from coim.designs.trust_region import check_reach, check_widening
 from coim.envs.morph import MorphEnv
 from coim.events import DesignChosen, DesignDone, Kind, Place
 from coim.learners.sac import SACLearner
@@ -82,12 +82,15 @@ class DesignChoice:
             far, a draw of Replay_Pop.
         reach: search only around the body with the best return so far, this share of each entry's range to both sides,
             in (0, 1]; None searches everywhere. See `coim.designs.TrustRegion`.
+        widening: what is added to ``reach`` for each body after the first ones, at least 0: the more is known, the
+            further away the next body may be.
         precision: of the networks' products in Eq. 5.
         seed: seeds the random designs. It may be the algorithm's own: their numbers are independent of all others'.
 
     Raises:
         ValueError: if a word such as ``bodies`` is unknown, ``num_start_states`` is below 1, ``reach`` is not in
-            (0, 1], first designs have the wrong shape, dtype or device, or they or the search leave the bounds.
+            (0, 1], ``widening`` is negative or without a reach, first designs have the wrong shape, dtype or device,
+            or they or the search leave the bounds.
         TypeError: if the search has no method ``maximise``, or first designs are no tensor.
 
     Example:
@@ -109,6 +112,7 @@ class DesignChoice:
         value_states: StatesAre = "stored",
         value_over: Literal["start", "visited"] = "start",
         reach: float | None = None,
+        widening: float = 0.0,
         precision: Literal["float32", "bfloat16"] = "float32",
         seed: int = 0,
     ) -> None:
@@ -124,9 +128,10 @@ class DesignChoice:
             _check_search(spec, search)
         if reach is not None:
             check_reach(reach)
+        check_widening(widening, reach)
         self.spec, self.first_designs, self.search, self.bodies = spec, first_designs, search, bodies
         self.num_start_states, self.value_states, self.value_over = num_start_states, value_states, value_over
-        self.precision, self.reach = precision, reach
+        self.precision, self.reach, self.widening = precision, reach, widening
         # On the CPU wherever the networks are: there the same seed gives the same bodies.
         self.rng = stream("designs", seed)
 
@@ -191,7 +196,8 @@ class DesignChoice:
             return self.search.maximise(objective)
         returns = torch.stack([done.best_return[run] for done in situation.tried]).nan_to_num(nan=-torch.inf)
         best = situation.tried[int(returns.argmax())].design[run]
-        return TrustRegion(self.spec, self.search, reach=self.reach).maximise(objective, centre=best)
+        reach = min(1.0, self.reach + self.widening * max(0, situation.index - len(self.first_designs)))
+        return TrustRegion(self.spec, self.search, reach=reach).maximise(objective, centre=best)
 
     def expect(self, objectives: list[Fitness], design: Tensor) -> tuple[Tensor, Tensor] | None:
         """Mean and deviation of the best return that is expected of designs ``[K, D]``, each ``[K]`` on the CPU.

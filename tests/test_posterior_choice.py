@@ -92,6 +92,26 @@ def test_a_run_that_has_diverged_expects_nothing() -> None:
             assert event.expected.isnan().tolist() == event.deviation.isnan().tolist() == [False, True]
 
 
+def test_a_reach_may_widen_with_each_body_until_it_is_everywhere() -> None:
+    events = list(choosing(1, designs=9, reach=0.1, widening=0.3))
+    done = {event.index: event for event in events if isinstance(event, DesignDone)}
+    first, distances = len(FIRST), {}
+    for event in chosen_of(events):
+        if event.kind == "optimised":
+            best = max((done[index] for index in range(event.index)), key=lambda before: before.best_return[0].item())
+            distances[event.index] = (event.design - best.design).abs().max().item()
+    limits = {index: min(1.0, 0.1 + 0.3 * (index - first)) * 1.5 + 1e-6 for index in distances}
+    assert len(distances) > 1
+    assert all(distances[index] <= limits[index] for index in distances)
+    assert max(distances.values()) > 0.1 * 1.5 + 1e-3  # it did widen
+    for widening, reach, words in (
+        (-0.1, 0.2, "widening is -0.1, it must be 0 or more"),
+        (0.1, None, "without a reach"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            PosteriorChoice(SPEC, FIRST, search=GradientSearch(SPEC, seed=0), reach=reach, widening=widening)
+
+
 def test_a_reach_keeps_the_search_around_the_best_body() -> None:
     algorithm = choosing(1, reach=0.1)
     events = list(algorithm)

@@ -73,3 +73,11 @@ def check_reach(reach: float) -> None:
     """Refuse a box that is empty or longer than the design space."""
     if not 0 < reach <= 1:
         raise ValueError(f"reach is {reach}, it must be in (0, 1]: a share of the range of each entry")
+
+
+def check_widening(widening: float, reach: float | None) -> None:
+    """Refuse a box that shrinks, and a widening of no box."""
+    if not 0 <= widening < float("inf"):
+        raise ValueError(f"widening is {widening}, it must be 0 or more: a share of the range of each entry")
+    if widening and reach is None:
+        raise ValueError(f"widening is {widening} without a reach that it could widen; give one, such as reach=0.25")

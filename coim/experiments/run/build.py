@@ -108,6 +108,7 @@ def make_choice(env: MorphEnv, settings: Settings, search: DesignSearch, *, seed
         "value_states": settings.value_states,
         "value_over": settings.value_over,
         "reach": settings.reach,
+        "widening": settings.widening,
         "precision": settings.precision,
         "seed": seed,
     }

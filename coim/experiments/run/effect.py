@@ -15,7 +15,11 @@ ROWS = ("mix", "imagined_states", "imagined_actions", "anchored", "governed")
 IMAGINATION = ("dream", "sigma", "imagined_share", "individual_imagined_share", *ROWS, *MODEL)
 # What has no effect, when, and the setting that decides it.
 RULES: tuple[tuple[tuple[str, ...], Callable[[Settings], bool], str], ...] = (
-    (("search", "chosen_by", "reach", *VALUE, *SWARM), lambda settings: settings.bodies != "search", "bodies"),
+    (
+        ("search", "chosen_by", "reach", "widening", *VALUE, *SWARM),
+        lambda settings: settings.bodies != "search",
+        "bodies",
+    ),
     (VALUE, lambda settings: settings.chosen_by == "returns", "chosen_by"),
     (SWARM, lambda settings: settings.search == "gradient", "search"),
     (IMAGINATION, lambda settings: settings.imagine == "none", "imagine"),

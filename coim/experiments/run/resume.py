@@ -25,7 +25,7 @@ ELSEWHERE = ("device", "replay_device", "compile")
 # Settings that may differ between a finished cell of a study and the same cell as it is asked for.
 OF_NO_NUMBER = FREE | {"out", "device", "replay_device", "name"}
 # Settings that older folders lack. Their defaults are what every run had before.
-LATER = {"replay_device", "products", "value_states", "value_over", "chosen_by", "reach"}
+LATER = {"replay_device", "products", "value_states", "value_over", "chosen_by", "reach", "widening"}
 LATER |= {"log", "imagined_states", "imagined_actions", "anchored", "governed"}
 FORMERLY = Choice("onednn", "onednn")  # the products of runs whose folder does not name them
 

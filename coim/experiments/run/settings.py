@@ -138,6 +138,8 @@ class Settings:
     Eq. 5 as its mean."""
     reach: Annotated[float, Field(gt=0, le=1)] | None = None
     """Search only this far around the best body so far, as a share of each entry's range; by default everywhere."""
+    widening: NonNegative = 0.0
+    """Added to the reach for each body after the first ones."""
 
     # -- this machine -------------------------------------------------------------------------------------------------
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -168,6 +170,10 @@ class Settings:
     """Print errors only."""
 
     def __post_init__(self) -> None:  # errors have the names of settings in backticks, for `pydantic_errors.sentence`
+        if self.widening and self.reach is None:
+            raise ValueError(
+                f"`widening` is {self.widening} without a `reach` that it could widen; give one, such as 0.25"
+            )
         if self.dream == "simulator" and self.imagine == "none":
             raise ValueError("`dream` simulator imagines nothing with `imagine` none; take known, noisy or random")
         if self.dream == "simulator" and self.governed:
