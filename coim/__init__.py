@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         SimulatorDynamics,
         WalkerMorph,
         WorldModelEnv,
+        morph_from_mjcf,
     )
     from coim.episode import run_episode
     from coim.events import DesignChosen, DesignDone, EpisodeDone, Event
@@ -89,6 +90,7 @@ else:
                 "SimulatorDynamics",
                 "WalkerMorph",
                 "WorldModelEnv",
+                "morph_from_mjcf",
             ],
             "episode": ["run_episode"],
             "events": ["DesignChosen", "DesignDone", "EpisodeDone", "Event"],
@@ -166,6 +168,7 @@ __all__ = [
     "load_run",
     "make_policy",
     "make_qvalue",
+    "morph_from_mjcf",
     "run_episode",
     "sample_batches",
     "sample_mixture",

@@ -19,6 +19,7 @@ except AttributeError as error:  # what PyOpenGL raises if the library of MUJOCO
 
 if TYPE_CHECKING:
     from .bodies import BODIES
+    from .from_mjcf import morph_from_mjcf
     from .gymnasium_env import GymnasiumEnv
     from .half_cheetah import HalfCheetahMorph
     from .hopper import HopperMorph
@@ -32,6 +33,7 @@ else:
         {
             "bodies": ["BODIES"],
             "gymnasium_env": ["GymnasiumEnv"],
+            "from_mjcf": ["morph_from_mjcf"],
             "half_cheetah": ["HalfCheetahMorph"],
             "hopper": ["HopperMorph"],
             "morph": ["MorphEnv"],
@@ -50,4 +52,5 @@ __all__ = [
     "SimulatorDynamics",
     "WalkerMorph",
     "WorldModelEnv",
+    "morph_from_mjcf",
 ]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import math
 import re
-from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from torch import Tensor
 from coim.envs.camera import Camera
 from coim.envs.kinematics import Kinematics
 from coim.envs.root import Root, give_floor, read_root
+from coim.envs.segments import Scale, Segments, keep_densities
 from coim.envs.simulation import Simulations
 from coim.randomness import restore_generator
 
@@ -45,6 +45,7 @@ class Fleet:
     """
 
     ASSET: ClassVar[str]  # XML file in assets/, or an absolute path
+    SCALE: ClassVar[Scale] = {}  # what each entry of a design scales, see `coim.envs.segments`
     DESIGN_SIZE: ClassVar[int]
     DESIGN_NAMES: ClassVar[tuple[str, ...]] = ()  # names of the design's entries; see design_names()
     DESIGN_BOUNDS: ClassVar[Bounds]  # lowest and highest factor, of all entries or a pair for each
@@ -74,7 +75,11 @@ class Fleet:
     def _simulate(self) -> Simulations:
         """Make the simulations of the current designs."""
         drawn = mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / self.ASSET))
+        if self.SCALE:
+            keep_densities(drawn)
         give_floor(drawn)
+        if self.SCALE:
+            self._segments = Segments(drawn, self.SCALE)
         return Simulations(
             drawn,
             shape_body=self.shape_body,
@@ -82,14 +87,16 @@ class Fleet:
             num_threads=self._num_threads,
         )
 
-    @abstractmethod
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
-        """Change the body at xi = 1 into the body of a design, in place.
+        """Change the body at xi = 1 into the body of a design, in place; by default as ``SCALE`` says.
 
         Args:
             spec: the body of the XML file, xi = 1.
             design: scale factors within the bounds, ``[D]`` float64.
         """
+        if not self.SCALE:
+            raise NotImplementedError(f"{type(self).__name__} has neither SCALE nor shape_body(); give it one of them")
+        self._segments.shape(spec, design)
 
     @classmethod
     def design_names(cls) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from coim.envs.morph import MorphEnv
 from coim.envs.task import Task, speed_along
 
 LEGS = (("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot"))
+PARTS = ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot")
 FORWARD_VELOCITY = -9  # entry of the observation, m/s
 
 
@@ -77,7 +78,8 @@ class HalfCheetahMorph(MorphEnv):
 
     ASSET = "half_cheetah.xml"
     DESIGN_SIZE = 6
-    DESIGN_NAMES = ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot")
+    DESIGN_NAMES = PARTS
+    SCALE: ClassVar = {part: (geom,) for part, geom in zip(PARTS, (*LEGS[0], *LEGS[1]))}
     DESIGN_BOUNDS = (0.8, 2.0)
     FRAME_SKIP = 5
     RESET_NOISE = 0.1
@@ -123,14 +125,7 @@ class HalfCheetahMorph(MorphEnv):
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
         """Scale each segment and move its children; the feet start at the same height above the floor as at xi = 1."""
         drop_as_drawn = _leg_drop(spec)
-        scales = (design * self._stretch).reshape(2, 3)
-        for leg, leg_scales in zip(LEGS, scales):
-            for name, child, scale in zip(leg, (*leg[1:], None), leg_scales):
-                geom = spec.geom(name)
-                geom.pos = geom.pos * scale
-                geom.size = [geom.size[0], geom.size[1] * scale, 0.0]
-                if child is not None:
-                    spec.body(child).pos = spec.body(child).pos * scale
+        self._segments.stretch(spec, design * self._stretch)
         torso = spec.body("torso")
         torso.pos = torso.pos + np.array([0.0, 0.0, _leg_drop(spec) - drop_as_drawn])
 

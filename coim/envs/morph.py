@@ -32,9 +32,10 @@ DONE_KEYS = ("done", "terminated", "truncated")
 class MorphEnv(Fleet, DesignedEnv):
     """A fleet of robots; a design vector sets their bodies at reset.
 
-    A new body is a subclass: an XML file, the constants of :class:`~coim.envs.fleet.Fleet`, :meth:`shape_body` (which
-    lengths scale) and :meth:`reward`. The robot runs in the plane of x and z, moves freely, or stands on a fixed base
-    (see `coim.envs.root`); its actuators are motors, and an action of -1 or 1 is an end of a motor's ``ctrlrange``.
+    A new body is a subclass: an XML file, the constants of :class:`~coim.envs.fleet.Fleet`, what scales (``SCALE``, or
+    :meth:`shape_body`) and :meth:`reward`; :func:`~coim.morph_from_mjcf` makes one without a class statement. The robot
+    runs in the plane of x and z, moves freely, or stands on a fixed base (see `coim.envs.root`); its actuators are
+    motors, and an action of -1 or 1 is an end of a motor's ``ctrlrange``.
 
     The input of a reset sets the design: ``env.reset(TensorDict({"design": xi}, [K]))``. It stays until a reset gives
     another one: auto-resets, partial resets and resets without ``design`` keep it. The first body has xi = 1. Only a
