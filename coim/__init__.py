@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         TrustRegion,
     )
     from coim.envs import (
+        AntMorph,
         GymnasiumEnv,
         HalfCheetahMorph,
         HopperMorph,
@@ -84,6 +85,7 @@ else:
             "learners.dynamics": ["DynamicsLearner"],
             "envs": [
                 "GymnasiumEnv",
+                "AntMorph",
                 "HalfCheetahMorph",
                 "HopperMorph",
                 "MorphEnv",
@@ -121,6 +123,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Agent",
+    "AntMorph",
     "Buffers",
     "CoAdaptation",
     "CoImSACLoss",

@@ -18,6 +18,7 @@ except AttributeError as error:  # what PyOpenGL raises if the library of MUJOCO
     ) from error
 
 if TYPE_CHECKING:
+    from .ant import AntMorph
     from .bodies import BODIES
     from .from_mjcf import morph_from_mjcf
     from .gymnasium_env import GymnasiumEnv
@@ -31,6 +32,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "ant": ["AntMorph"],
             "bodies": ["BODIES"],
             "gymnasium_env": ["GymnasiumEnv"],
             "from_mjcf": ["morph_from_mjcf"],
@@ -45,6 +47,7 @@ else:
 
 __all__ = [
     "BODIES",
+    "AntMorph",
     "GymnasiumEnv",
     "HalfCheetahMorph",
     "HopperMorph",

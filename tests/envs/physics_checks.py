@@ -58,7 +58,7 @@ def difference_from(model: mujoco.MjModel, env: MorphEnv, num_steps: int) -> flo
 def mass_error(env: MorphEnv) -> float:
     """Largest relative error of a body's mass against density times the volume of its capsules."""
     model = env.simulations.model(0)
-    density = 1000.0 if env.ASSET != "half_cheetah.xml" else 660.8849500774736
+    density = {"half_cheetah.xml": 660.8849500774736, "ant.xml": 5.0}.get(env.ASSET, 1000.0)
     masses = np.zeros(model.nbody)
     for i in range(1, model.ngeom):  # 0 is the floor
         radius, half_length = model.geom_size[i, :2]

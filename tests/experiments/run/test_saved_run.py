@@ -148,7 +148,7 @@ def test_what_is_no_run_or_no_run_yet_is_said(fleet: Made, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ('"hopper"', '"snake"', "'snake' is none of half_cheetah, hopper, walker; give its class as body="),
+        ('"hopper"', '"snake"', "'snake' is none of half_cheetah, hopper, walker, ant; give its class as body="),
         ('"num_cells"', '"cells"', "has no setting 'num_cells'; load it with the version"),
         ('"settings"', '"options"', "names no environment and settings"),
         ("{", "", "config.json is damaged"),

@@ -81,7 +81,7 @@ def test_seeds_can_share_a_cell_along_the_run_axis() -> None:
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"environments": ("ant",)}, "'ant' is no environment; there are half_cheetah, hopper, walker"),
+        ({"environments": ("snake",)}, "'snake' is no environment; there are half_cheetah, hopper, walker, ant"),
         ({"arms": ("oracel",)}, "arm 'oracel' is none of none, known"),
         ({"tasks": ("up",)}, "tasks has 'up', each must be 'forward' or 'backward'"),
         ({"protocol": "papre"}, "protocol is 'papre', it must be 'paper', 'preview', 'pilot' or 'smoke'"),
