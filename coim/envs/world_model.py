@@ -26,6 +26,7 @@ from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check
 from coim.randomness import restore_generator
 
 STATE_KEYS = ("observation", "design")
+ROUNDING = 1e-6  # of the length of a unit quaternion in float32
 
 
 class Dynamics(Protocol):
@@ -164,7 +165,7 @@ class WorldModelEnv(DesignedEnv):
         Returns:
             Next observation ``[*B, S]`` with its angles in (-pi, pi] and its quaternion of length 1, and reward
             ``[*B, 1]``. If nothing differs from the real transition, the result is its next observation to the last
-            bit; a quaternion, up to the rounding of its length.
+            bit.
 
         Raises:
             TypeError: if the model has no ``means``.
@@ -196,8 +197,10 @@ class WorldModelEnv(DesignedEnv):
         """
         if (at := self.quaternion_index) is None:
             return observation
-        turned = torch.nn.functional.normalize(observation[..., at : at + 4], dim=-1)
-        return torch.cat([observation[..., :at], turned, observation[..., at + 4 :]], -1)
+        quaternion = observation[..., at : at + 4]
+        length = quaternion.norm(dim=-1, keepdim=True).clamp(min=ROUNDING)
+        length = torch.where((length - 1).abs() < ROUNDING, 1.0, length)  # a real one stays, to the last bit
+        return torch.cat([observation[..., :at], quaternion / length, observation[..., at + 4 :]], -1)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step the ``observation`` and ``design`` of the input; the dream's own ones if they are missing."""
