@@ -3,9 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# The benchmarks compare with other libraries, which nothing else needs: an environment of their own.
+# The benchmarks compare with other libraries, and the site needs Sphinx, which nothing else does: environments of their own.
 BENCH_VENV := .venv-bench
 BENCH_STAMP := $(BENCH_VENV)/.installed
+DOCS_VENV := .venv-docs
+DOCS_STAMP := $(DOCS_VENV)/.installed
 RIVALS := stable-baselines3==2.9.2 sbx-rl==0.28.0 jax==0.10.2
 
 # What a GPU needs: an environment beside the torch that is there, installed from the folder WHEELS where there is no network.
@@ -14,7 +16,7 @@ GPU_STAMP := $(GPU_VENV)/.installed
 WHEELS ?=
 GPU_PIP = $(GPU_VENV)/bin/python -m pip install --quiet --disable-pip-version-check $(if $(WHEELS),--no-index --find-links $(WHEELS),)
 
-.PHONY: run test test-lowest test-highest lint types bench gpu clean
+.PHONY: run test test-lowest test-highest lint types bench docs gpu clean
 
 run: $(STAMP)
 	$(BIN)/coim run half_cheetah --preset quick
@@ -45,6 +47,11 @@ types: $(STAMP)
 bench: $(BENCH_STAMP)
 	$(BENCH_VENV)/bin/python -m benchmarks
 
+# Runs every tutorial and asks no network; DOCS=-Dplot_gallery=0 leaves the tutorials out. Then every internal link is followed.
+docs: $(DOCS_STAMP)
+	OMP_NUM_THREADS=1 $(DOCS_VENV)/bin/python -m sphinx -b html -W --keep-going -d docs/build/doctrees $(DOCS) docs docs/build/html
+	$(DOCS_VENV)/bin/python docs/links.py docs/build/html
+
 gpu:
 	@$(PYTHON) benchmarks/missing.py
 	@$(MAKE) --no-print-directory $(GPU_STAMP)
@@ -64,6 +71,12 @@ $(BENCH_STAMP): setup.cfg pyproject.toml constraints.txt
 	$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[experiments]' $(RIVALS)
 	@touch $@
 
+$(DOCS_STAMP): setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check "$$(grep '^torch==' constraints.txt)"
+	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[experiments,docs]'
+	@touch $@
+
 # torch, built for CUDA, is found where PYTHON has it, be that a system's folder or another environment's.
 $(GPU_STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv --system-site-packages $(GPU_VENV)
@@ -73,4 +86,4 @@ $(GPU_STAMP): setup.cfg pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(BENCH_VENV) $(GPU_VENV) .venv-lowest .venv-highest *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH_VENV) $(DOCS_VENV) $(GPU_VENV) docs/build docs/gallery docs/api/names .venv-lowest .venv-highest *.egg-info .mypy_cache .ruff_cache .pytest_cache
