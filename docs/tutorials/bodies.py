@@ -87,3 +87,17 @@ for _ in range(3):
 row = rows[0, 0]
 again = HopperMorph.reward(row["observation"], row["action"], row["next", "observation"], row["design"])
 print(torch.equal(again, row["next", "reward"]))
+
+# %%
+# In Gymnasium
+# ------------
+#
+# The same bodies have Gymnasium's interface. An observation then ends with the design.
+
+import gymnasium
+
+single = gymnasium.make("coim/Hopper-v0", design=[1.0, 1.5, 0.5, 1.0], max_episode_steps=100)
+observation, info = single.reset(seed=0)
+print(observation.shape, info["design"])
+_, info = single.reset(options={"design": [1.0, 1.0, 0.5, 2.0]})
+print(info["design"])

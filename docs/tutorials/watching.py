@@ -40,7 +40,7 @@ folder = run(HopperMorph, "hopper", settings)
 from coim import load_run, run_episode
 
 loaded = load_run(folder)
-best = max(loaded.designs, key=lambda design: design.best_return)
+best = loaded.best.tried
 print(f"body {best.number}, {best.kind}:", dict(zip(loaded.bodies.design_names(), best.design.tolist())))
 print("best return", round(best.best_return, 3))
 
@@ -101,3 +101,8 @@ else:
 #     coim watch runs/A --design top5      # five bodies side by side
 #     coim report runs/A                   # report.html, also while the run is going on
 #     coim report runs/A runs/B            # two runs on one page
+#
+# To take a policy away::
+#
+#     coim evaluate runs/A --design best --episodes 20     # its return and spread, from other starts
+#     coim export runs/A --design best --to policy.onnx    # for other programs, with the body beside it
