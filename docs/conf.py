@@ -10,12 +10,19 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from pydoc import locate
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]  # reading_order, coim
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads that wait for each other collapse beside other work
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL tells of each buffer otherwise
 os.environ.setdefault("MUJOCO_GL", "egl")  # pictures without a screen; mujoco asks for it when it is imported
+
+from docutils.nodes import Element  # noqa: E402
+from sphinx.addnodes import pending_xref  # noqa: E402
+from sphinx.application import Sphinx  # noqa: E402
+from sphinx.environment import BuildEnvironment  # noqa: E402
+from sphinx.util.nodes import make_refnode  # noqa: E402
 
 import coim  # noqa: E402
 
@@ -28,7 +35,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["build", "tutorials", "README.md"]
+exclude_patterns = ["build", "tutorials", "results/preview/figures/[!R]*.md"]
 templates_path = ["templates"]
 nitpicky = True  # a reference that leads nowhere is a warning, and with -W an error
 
@@ -42,10 +49,42 @@ autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
 napoleon_use_ivar = True
 napoleon_use_rtype = False
-# Other libraries have sites of their own, and no network is used to look names up there.
-OTHERS = "torch|torchrl|tensordict|mujoco|numpy|np|pandas|pd|scipy|matplotlib|gymnasium|pyswarms|botorch|gpytorch"
+
+
+def first_line_is_text(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Keep napoleon from reading "paper: the protocol" below an attribute as the type ``paper`` and a text."""
+    if what in ("attribute", "data", "property") and lines:
+        lines.insert(0, "")
+
+
+def without_page(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Element) -> Element | None:
+    """Resolve a name that is public under a shorter one, and let names pass that exist without a page of their own.
+
+    Other libraries have sites of their own, and no network is used to look names up there. A word in single backticks
+    may be a parameter or a value. What is left is a mistake, and a warning.
+    """
+    if node.get("refdomain") != "py":
+        return None
+    target, module = node["reftarget"], node.get("py:module")
+    parts = target.split(".")
+    if len(parts) > 1 or "_" in target or target[0].isupper():  # "imagine" may be the setting
+        for words in (parts, parts[-2:], parts[-1:]):
+            found = env.domains.python_domain.find_obj(env, "", "", ".".join(["coim", *words]), None, 0)
+            for name, entry in found[:1]:
+                return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, content, name)
+    exists = any(locate(name) is not None for name in (target, f"{module}.{target}", f"collections.abc.{target}"))
+    return content if exists or node["reftype"] == "obj" else None
+
+
+def setup(app: Sphinx) -> None:
+    """Take part in what Sphinx does."""
+    app.connect("autodoc-process-docstring", first_line_is_text, priority=400)  # napoleon has 500
+    app.connect("missing-reference", without_page)
+
+
+# Names that pydantic and typing put into signatures.
 nitpick_ignore_regex = [
-    ("py:.*", rf"({OTHERS})(\..*)?"),
+    ("py:class", r"(NoneType|FieldInfo|Field|Ge|Gt|Le|Lt|Strict|MinLen|.*Annotated|Positional|.*ValidationInfo)"),
 ]
 
 # -- pages in Markdown ------------------------------------------------------------------------------------------------

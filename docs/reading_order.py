@@ -11,6 +11,7 @@ TUTORIALS = (
     "ensemble",
     "choosing",
     "study",
+    "own_robot",
     "gpu_and_cluster",
     "watching",
 )
