@@ -67,23 +67,31 @@ def when_imported(module: str, call: Callable[[], None]) -> None:
 
 
 class _Waiting(MetaPathFinder):
-    """Finds one module as all other finders do, and calls a function behind its import; then it is gone."""
+    """Finds one module as all other finders do, and calls a function behind its import; then it is gone.
+
+    It stays while others only look whether the module is there, as TorchRL does.
+    """
 
     def __init__(self, module: str, call: Callable[[], None]) -> None:
-        self._module, self._call = module, call
+        self._module, self._call, self._looking = module, call, False
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """The module's spec with a loader that calls the function; None for every other module."""
-        if fullname != self._module:
+        if fullname != self._module or self._looking:
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(fullname)
+        self._looking = True
+        try:
+            spec = find_spec(fullname)
+        finally:
+            self._looking = False
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
             def exec_module(module: ModuleType) -> None:
+                if self in sys.meta_path:
+                    sys.meta_path.remove(self)
                 execute(module)
                 self._call()
 

@@ -101,7 +101,6 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "write_computation_times": False,
     "abort_on_example_error": True,
-    "doc_module": ("coim",),
     "backreferences_dir": None,
     "min_reported_time": 1,
 }

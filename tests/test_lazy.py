@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +90,8 @@ def test_a_call_waits_for_its_module_and_is_made_once(tmp_path: Path, monkeypatc
     finders, seen = list(sys.meta_path), []
     when_imported("made_up_module", lambda: seen.append(sys.modules["made_up_module"].value))
     assert importlib.import_module("json") is not None
+    for _ in range(2):
+        assert importlib.util.find_spec("made_up_module") is not None  # looks, and imports nothing
     assert seen == []
     importlib.reload(importlib.import_module("made_up_module"))
     assert (seen, sys.meta_path) == ([1], finders)

@@ -44,12 +44,14 @@ from pathlib import Path
 
 import coim
 from coim.experiments.statistics.measures import comparisons, measures
+from coim.experiments.statistics.retrained import with_retrained
 from coim.experiments.study.runs import read_runs
 
-runs = read_runs(Path(coim.__file__).parents[1] / "docs" / "results" / "preview")
-measured = measures(runs)
+folder = Path(coim.__file__).parents[1] / "docs" / "results" / "preview"
+runs = read_runs(folder)
+measured = with_retrained(measures(runs), folder)
 hopper = measured[measured["environment"] == "hopper"]
-print(hopper.groupby("arm")[["area", "final", "search_gain"]].agg(["mean", "std"]).round(0))
+print(hopper.groupby("arm")[["area", "final", "retrained", "search_gain"]].agg(["mean", "std"]).round(0))
 
 # %%
 # ``area`` is the mean best return over all bodies of a run: how fast it learns. ``final`` is the best return of all
@@ -69,7 +71,16 @@ axes.set(xlabel="area", yticks=range(4), yticklabels=sorted(set(hopper["arm"])))
 
 table = comparisons(runs, measured)
 known = table[(table["environment"] == "hopper") & (table["arm"] == "known") & (table["against"] == "none")]
-columns = ["measure", "difference", "difference_low", "difference_high", "welch_p", "welch_p_holm", "detectable"]
+columns = [
+    "measure",
+    "runs",
+    "difference",
+    "difference_low",
+    "difference_high",
+    "welch_p",
+    "welch_p_holm",
+    "detectable",
+]
 print(known[columns].round(2).to_string(index=False))
 
 # %%
