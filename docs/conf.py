@@ -11,6 +11,7 @@ import os
 import sys
 from pathlib import Path
 from pydoc import locate
+from typing import Any
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]  # reading_order, coim
@@ -22,6 +23,7 @@ from docutils.nodes import Element  # noqa: E402
 from sphinx.addnodes import pending_xref  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
 from sphinx.environment import BuildEnvironment  # noqa: E402
+from sphinx.util import inspect  # noqa: E402
 from sphinx.util.nodes import make_refnode  # noqa: E402
 
 import coim  # noqa: E402
@@ -35,13 +37,12 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["build", "tutorials", "results/preview/figures/[!R]*.md"]
+exclude_patterns = ["build", "tutorials"]
 templates_path = ["templates"]
 nitpicky = True  # a reference that leads nowhere is a warning, and with -W an error
 
 # -- the API reference ------------------------------------------------------------------------------------------------
 default_role = "py:obj"  # docstrings name things in single backticks
-rst_prolog = ".. py:currentmodule:: coim\n"
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
@@ -54,7 +55,23 @@ napoleon_use_rtype = False
 def first_line_is_text(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Keep napoleon from reading "paper: the protocol" below an attribute as the type ``paper`` and a text."""
     if what in ("attribute", "data", "property") and lines:
-        lines.insert(0, "")
+        lines[:0] = ["..", ""]  # an empty comment
+
+
+def own_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: object, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Show what ``__init__`` takes where a metaclass of TorchRL hides it."""
+    if what == "class" and signature == "(*args, **kwargs)":
+        own = inspect.signature(obj.__init__, bound_method=True)
+        signature = inspect.stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
+    return signature, returns
+
+
+def table_has_title(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Give the tables beside figures a title: pages do not get on without, and elsewhere they are parts of a page."""
+    if not source[0].startswith("#") and docname.startswith("results/"):
+        source[0] = f"# {Path(docname).name}\n\n{source[0]}"
 
 
 def without_page(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Element) -> Element | None:
@@ -67,18 +84,26 @@ def without_page(app: Sphinx, env: BuildEnvironment, node: pending_xref, content
         return None
     target, module = node["reftarget"], node.get("py:module")
     parts = target.split(".")
-    if len(parts) > 1 or "_" in target or target[0].isupper():  # "imagine" may be the setting
+    if module is None or len(parts) > 1 or "_" in target or target[0].isupper():  # "imagine" may be the setting
         for words in (parts, parts[-2:], parts[-1:]):
             found = env.domains.python_domain.find_obj(env, "", "", ".".join(["coim", *words]), None, 0)
             for name, entry in found[:1]:
                 return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, content, name)
-    exists = any(locate(name) is not None for name in (target, f"{module}.{target}", f"collections.abc.{target}"))
-    return content if exists or node["reftype"] == "obj" else None
+    return content if node["reftype"] == "obj" or exists(target, module, node.get("py:class")) else None
+
+
+def exists(target: str, module: str | None, kind: str | None) -> bool:
+    """Whether a name is that of something, seen from where it stands or from a module of ours."""
+    ours = [name for name in sys.modules if name.split(".")[0] == "coim"]
+    places = [module, f"{module}.{kind}", "collections.abc", *ours]
+    return any(locate(name) is not None for name in (target, *(f"{place}.{target}" for place in places)))
 
 
 def setup(app: Sphinx) -> None:
     """Take part in what Sphinx does."""
     app.connect("autodoc-process-docstring", first_line_is_text, priority=400)  # napoleon has 500
+    app.connect("autodoc-process-signature", own_signature)
+    app.connect("source-read", table_has_title)
     app.connect("missing-reference", without_page)
 
 
@@ -103,6 +128,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "backreferences_dir": None,
     "min_reported_time": 1,
+    "capture_repr": (),
 }
 
 # -- the pages' looks -------------------------------------------------------------------------------------------------

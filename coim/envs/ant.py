@@ -56,8 +56,7 @@ class AntMorph(MorphEnv):
     ranges of the ankles, which drive them down; the torso starts higher by what the ends of the longest legs then are
     lower, so that no leg is driven into the floor.
 
-    Keyword Args:
-        num_runs, task, episode_steps, reset_noise, seed, num_threads, device: see :class:`~coim.envs.morph.MorphEnv`.
+    Its arguments are those of :class:`~coim.envs.morph.MorphEnv`.
 
     Example:
         >>> env = AntMorph(num_runs=2, seed=0)

@@ -65,7 +65,8 @@ class HalfCheetahMorph(MorphEnv):
 
     Keyword Args:
         segment_lengths: lengths at xi = 1 in m, in the order of the design; Gymnasium's by default.
-        num_runs, task, episode_steps, reset_noise, seed, num_threads, device: see :class:`~coim.envs.morph.MorphEnv`.
+
+    Its other arguments are those of :class:`~coim.envs.morph.MorphEnv`.
 
     Example:
         >>> from tensordict import TensorDict

@@ -54,8 +54,7 @@ class HopperMorph(MorphEnv):
     Reward: ``max(h > 0.5, 0.1) * (max(dx, 0) + 1) - 0.1 * abs(pitch)`` with the height h in m, the horizontal speed dx
     in m/s and the pitch in rad after the step, as printed.
 
-    Keyword Args:
-        num_runs, task, episode_steps, reset_noise, seed, num_threads, device: see :class:`~coim.envs.morph.MorphEnv`.
+    Its arguments are those of :class:`~coim.envs.morph.MorphEnv`.
 
     Example:
         >>> env = HopperMorph(num_runs=2, seed=0)

@@ -61,7 +61,8 @@ class WalkerMorph(MorphEnv):
 
     Keyword Args:
         observe_root_x: observe the distance travelled, the first of the paper's 18 dimensions; Gymnasium leaves it out.
-        num_runs, task, episode_steps, reset_noise, seed, num_threads, device: see :class:`~coim.envs.morph.MorphEnv`.
+
+    Its other arguments are those of :class:`~coim.envs.morph.MorphEnv`.
 
     Example:
         >>> env = WalkerMorph(num_runs=2, seed=0)
