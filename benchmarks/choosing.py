@@ -85,7 +85,8 @@ def study(arm: Arm, surface: Surface, seed: int) -> Study:
                 posterior = _posterior(arm, surface, torch.stack(designs), returns, values)
                 listened.append(float(posterior.slope > 0))
             if chosen:
-                designs.append(_chosen(arm, surface, posterior, values, search, torch.stack(designs)[returns.argmax()]))
+                best = torch.stack(designs)[returns.argmax()]
+                designs.append(_chosen(arm, surface, posterior, values, search, best, n - first))
             elif arm.explore == "uncertain":
                 designs.append(search.maximise(_deviation(posterior))[0])
             else:
@@ -147,14 +148,16 @@ def _chosen(
     values: Fitness | None,
     search: GradientSearch,
     best: Tensor,
+    later: int,
 ) -> Tensor:
-    """The next body ``[D]``; ``best`` is the one with the highest return so far."""
+    """The next body ``[D]``; ``best`` is the one with the highest return of the first ones and ``later`` others."""
     fitness = {"critic": values, "posterior": posterior, "improvement": None}[arm.choose]
     if fitness is None:
         fitness = _improvement(posterior)
     if arm.reach is None:
         return search.maximise(fitness)[0]
-    return TrustRegion(surface.spec, search, reach=arm.reach).maximise(fitness, centre=best)[0]
+    reach = min(1.0, arm.reach + arm.widening * later)
+    return TrustRegion(surface.spec, search, reach=reach).maximise(fitness, centre=best)[0]
 
 
 def _deviation(posterior: DesignPosterior) -> Fitness:

@@ -17,6 +17,7 @@ class Arm:
             networks over "stored" start states or "matched" visited ones.
         optimism: of the upper confidence bound.
         reach: of a trust region around the body with the best return so far; None: the whole space.
+        widening: of the reach, with each body.
         explore: every second body: "random", or "uncertain" (where the posterior deviates most).
         spread, noise, length: constants of the priors where they are not the library's.
         designs: bodies of a study.
@@ -28,6 +29,7 @@ class Arm:
     critic: float | str | None = None
     optimism: float = 0.5
     reach: float | None = None
+    widening: float = 0.0
     explore: str = "random"
     spread: float | None = None
     noise: float | None = None
@@ -42,6 +44,8 @@ def _arms() -> Iterator[Arm]:
     for critic in ("matched", "stored", 0.5):
         yield Arm(name="critic alone", choose="critic", critic=critic)
     yield Arm(name="trust region of 0.25", reach=0.25)
+    for critic in (None, "matched"):
+        yield Arm(name="trust region of 0.25 that widens by 0.1", critic=critic, reach=0.25, widening=0.1)
     yield Arm(name="most uncertain exploration", explore="uncertain")
     yield Arm(name="noisy expected improvement", choose="improvement")
     yield Arm(name="spread of priors 1", spread=1.0)

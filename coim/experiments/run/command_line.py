@@ -25,7 +25,8 @@ class Written(Settings):
 
     method: Literal["paper", "grounded"] | None = None
     """Way to choose the next body. paper: maximise Eq. 5 as printed. grounded: a Gaussian process over the returns
-    earned so far, with Eq. 5 over visited states as its mean. By default that of the preset: grounded in quick."""
+    earned so far, with Eq. 5 over visited states as its mean, at first near the best body and then further away. By
+    default that of the preset: grounded in quick."""
 
     def __post_init__(self) -> None:
         pass

@@ -11,7 +11,7 @@ DEVELOP, CONFIRM = tuple(range(5)), tuple(range(20, 30))
 
 def bodies(name: str, seeds: tuple[int, ...]) -> Study:
     """Ways of choosing bodies, all without imagination."""
-    arms = ("none", "random-bodies", "matched", "visited", "returns", "grounded")
+    arms = ("none", "random-bodies", "matched", "visited", "returns", "posterior", "grounded")
     return Study(name=name, environments=("hopper",), arms=arms, seeds=seeds, protocol="pilot")
 
 

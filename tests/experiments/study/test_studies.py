@@ -16,7 +16,7 @@ from coim.envs import BODIES
 from coim.experiments.commands.study import main as entry
 from coim.experiments.run.build import build
 from coim.experiments.run.resume import to_go_on
-from coim.experiments.run.settings import Settings, plain
+from coim.experiments.run.settings import METHODS, Settings, plain
 from coim.experiments.study.arms import ARMS
 from coim.experiments.study.cell import compute, episodes_done, seconds_of, tries
 from coim.experiments.study.definition import PROTOCOLS, Block, Study, from_json
@@ -150,11 +150,11 @@ def test_a_method_is_confirmed_by_the_study_it_was_developed_on_with_other_seeds
         assert own[0] == own[1]
         assert not {*develop.seeds} & {*confirm.seeds}
     counts = [len(STUDIES[name].cells()) for name in ("bodies-develop", "bodies", "imagining-develop", "imagining")]
-    assert counts == [6 * 5, 6 * 10, (7 + 4) * 5, (7 + 4) * 10]
+    assert counts == [7 * 5, 7 * 10, (7 + 4) * 5, (7 + 4) * 10]
 
 
 def test_an_arm_that_imagines_with_grounded_bodies_differs_from_its_namesake_in_the_choice_alone() -> None:
-    choice = {name: ARMS["grounded"].settings[name] for name in ("chosen_by", "value_states", "value_over")}
+    choice = METHODS["grounded"]
     for imagine in ("known", "noisy", "random"):
         assert ARMS[f"grounded-{imagine}"].settings == ARMS[imagine].settings | choice
 
