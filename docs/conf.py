@@ -48,6 +48,7 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
 napoleon_use_ivar = True
 napoleon_use_rtype = False
 
@@ -129,6 +130,7 @@ sphinx_gallery_conf = {
     "backreferences_dir": None,
     "min_reported_time": 1,
     "capture_repr": (),
+    "remove_config_comments": True,
 }
 
 # -- the pages' looks -------------------------------------------------------------------------------------------------

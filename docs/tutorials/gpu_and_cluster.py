@@ -61,16 +61,14 @@ print(rows.batch_size, losses["loss_qvalue"].shape)
 #     coim study paper --ray-address 10.0.0.1:6379 --cpus 2
 #     coim study paper --ray-address auto --cpus 2 --gpus 0.25
 #
-# ``--gpus 0.25`` lets four cells share a GPU. ``seeds_per_cell`` in the study's file puts several seeds into one
-# cell, where they are trained together:
+# ``--gpus 0.25`` lets four cells share a GPU. ``seeds_per_cell`` in the study's file puts several seeds into one cell,
+# where they are trained together. Forty runs are then four cells:
 
-import json
+from coim.experiments.study.definition import Study
 
-print(
-    json.dumps(
-        {"name": "many", "environments": ["walker"], "arms": ["none", "known"], "seeds": [0, 10], "seeds_per_cell": 10}
-    )
-)
+study = Study(name="many", environments=("walker",), arms=("none", "known"), seeds=tuple(range(20)), seeds_per_cell=10)
+for cell in study.cells():
+    print(cell.name, cell.settings.num_runs)
 
 # %%
 # A cell whose process or node dies is taken up from its last checkpoint. ``ledger.csv`` in the study's folder says

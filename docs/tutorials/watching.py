@@ -106,3 +106,5 @@ else:
 #
 #     coim evaluate runs/A --design best --episodes 20     # its return and spread, from other starts
 #     coim export runs/A --design best --to policy.onnx    # for other programs, with the body beside it
+#
+# sphinx_gallery_thumbnail_number = -1

@@ -35,6 +35,17 @@ def test_every_page_is_in_a_table_of_contents() -> None:
     assert pages == set(re.findall(r"^   (\w+)$", (DOCS / "api" / "index.rst").read_text(), re.MULTILINE))
 
 
+def test_parts_of_other_files_are_where_pages_look_for_them() -> None:
+    found = 0
+    for page in DOCS.glob("*.md"):
+        for name, options in re.findall(r"```\{include\} (\S+)\n(.*?)```", page.read_text(), re.DOTALL):
+            text = (DOCS / name).read_text()
+            marks = re.findall(r'^:(?:start-after|end-before): "(.*)"$', options, re.MULTILINE)
+            assert [text.count(f"{mark}\n") for mark in marks] == [1] * len(marks), (page.name, marks)
+            found += 1
+    assert found == 4
+
+
 def test_the_times_of_the_hardware_page_were_measured() -> None:
     measured = {}
     for figure in json.loads((DOCS / "results" / "benchmarks.json").read_text())["figures"]:
