@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +35,7 @@ try:
         from botorch.exceptions.warnings import OptimizationWarning
         from botorch.models import SingleTaskGP
         from botorch.optim.fit import fit_gpytorch_mll_scipy
+        from botorch.posteriors.gpytorch import GPyTorchPosterior
         from gpytorch.constraints import GreaterThan
         from gpytorch.kernels import RBFKernel, ScaleKernel
         from gpytorch.likelihoods import GaussianLikelihood
@@ -140,6 +142,20 @@ class DesignPosterior:
         """Return the mean and the deviation, noise included, of the return of designs ``[P, D]``: two of ``[P]``."""
         mean, variance = self._posterior(designs)
         return mean.to(designs), (variance + self.noise**2).sqrt().to(designs)
+
+    @torch.no_grad()
+    def difference(self, designs: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how much more designs ``[P, D]`` earn than others ``[P, D]``: mean and deviation, ``[P]`` each.
+
+        It is the difference of the bodies' own parts of the return, without noise. Neighbours are known together: its
+        deviation is far less than that of either body.
+        """
+        pairs = torch.stack([self.inputs(designs), self.inputs(others)], -2)  # [P, 2, D + 2]
+        found = cast(GPyTorchPosterior, self.model.posterior(pairs))  # as it has no transform of its outcome
+        mean, covariance = found.mean.squeeze(-1), found.distribution.covariance_matrix
+        weights = mean.new_tensor([1.0, -1.0])
+        variance = (weights @ covariance @ weights).clamp(min=0)  # rounding can take it below 0
+        return (self._scale * (mean @ weights)).to(designs), (self._scale * variance.sqrt()).to(designs)
 
     def inputs(self, designs: Tensor) -> Tensor:
         """What the model reads of designs ``[P, D]`` that would be built next: ``[P, D + 2]``, differentiable.

@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": "run a policy for some episodes: mean, spread, and a CSV file",
     "export": "write a policy and its body for other programs",
     "dataset": "write the transitions of a run as a Minari dataset",
+    "atlas": "write a page with every body of a run, and a robot that walks in it",
     "figures": "draw the figures of a study",
     "retrain": "train the best bodies of a study again from scratch",
     "archive": "copy the tables of a study, without its checkpoints",

@@ -220,3 +220,14 @@ def test_a_trust_region_refuses_a_centre_outside_and_a_reach_of_nothing() -> Non
         TrustRegion(SPEC, search).maximise(bowl, centre=torch.tensor([2.5, 1.0]))
     with pytest.raises(ValueError, match="reach is 0"):
         TrustRegion(SPEC, search, reach=0)
+
+
+def test_the_difference_of_two_bodies_is_that_of_their_means_and_of_neighbours_surer_than_either() -> None:
+    designs = built(20)
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs))
+    bodies = built(3, seed=9)
+    mean, deviation = posterior.difference(bodies, bodies + 0.05)
+    assert torch.allclose(mean, posterior.predict(bodies)[0] - posterior.predict(bodies + 0.05)[0], atol=1e-3)
+    own = (posterior.predict(bodies)[1] ** 2 - posterior.noise**2).sqrt()
+    assert bool((deviation < own / 2).all())
+    assert posterior.difference(bodies, bodies)[1].abs().max() < 1e-2
