@@ -35,6 +35,8 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # equations are drawn without a network too
     "sphinx_gallery.gen_gallery",
 ]
 exclude_patterns = ["build", "tutorials"]
@@ -139,4 +141,5 @@ html_title = f"coim {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+mathjax_path = "mathjax/tex-chtml.js"
 html_show_sphinx = False
