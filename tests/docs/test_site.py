@@ -35,6 +35,13 @@ def test_every_page_is_in_a_table_of_contents() -> None:
     assert pages == set(re.findall(r"^   (\w+)$", (DOCS / "api" / "index.rst").read_text(), re.MULTILINE))
 
 
+def test_every_page_of_results_is_listed() -> None:
+    patterns = re.findall(r"^results/.*$", (DOCS / "results.md").read_text(), re.MULTILINE)
+    pages = [Path("/") / path.relative_to(DOCS).with_suffix("") for path in (DOCS / "results").rglob("*.md")]
+    assert len(pages) > 5
+    assert [page for page in pages if not any(page.match(f"/{p}") for p in patterns)] == []
+
+
 def test_parts_of_other_files_are_where_pages_look_for_them() -> None:
     found = 0
     for page in DOCS.glob("*.md"):
