@@ -22,8 +22,10 @@ run: $(STAMP)
 	$(BIN)/coim run half_cheetah --preset quick
 
 # One thread: threads that wait for each other in tiny products collapse when another process wants the same cores.
+# A process for each core instead, but no more than 4, as each takes 1.5 GB; the tests of a file stay together.
+PROCESSES ?= -n auto --maxprocesses 4 --dist loadfile
 test: lint types
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PROCESSES)
 
 # The tests on the lowest versions that setup.cfg allows, and on the newest there are, each in an environment of its own.
 # On another Python, torch, or on some tests: make test-lowest PYTHON=python3.13 TORCH=2.13.0 TESTS=tests/models
@@ -35,7 +37,7 @@ test-lowest test-highest: test-%:
 	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt "torch$(if $(TORCH),==$(TORCH))"
 	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -c .venv-$*/constraints.txt -e '.[experiments,dev]'
 	.venv-$*/bin/python -m pip list --disable-pip-version-check
-	OMP_NUM_THREADS=1 .venv-$*/bin/python -m pytest $(TESTS)
+	OMP_NUM_THREADS=1 .venv-$*/bin/python -m pytest $(PROCESSES) $(TESTS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
