@@ -20,8 +20,8 @@ SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
 TINY = dataclasses.replace(PROTOCOLS["smoke"], num_designs=1, imagine="none", threads=1, quiet=True)
 
 
-def test_there_are_ten_snippets() -> None:
-    assert len(SNIPPETS) == 10
+def test_there_are_eleven_snippets() -> None:
+    assert len(SNIPPETS) == 11
 
 
 @pytest.mark.parametrize("snippet", SNIPPETS, ids=lambda text: text.splitlines()[-1][:40])
