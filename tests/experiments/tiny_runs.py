@@ -25,7 +25,9 @@ TINY = dataclasses.replace(PROTOCOLS["smoke"], num_designs=4, first_episodes=2, 
 OPTIONS = options(dataclasses.replace(PROTOCOLS["smoke"], num_designs=7))
 IDLE_BESIDE = {
     **{word: {"--model-updates", "--model-cells"} for word in ("none", "simulator")},
-    **{word: {"--num-particles", "--num-iterations"} for word in ("fixed", "gradient")},
+    "gradient": {"--num-particles", "--num-iterations"},
+    "fixed": {"--num-particles", "--num-iterations", "--num-start-states"},
+    "returns": {"--num-start-states"},
 }
 
 
