@@ -25,9 +25,7 @@ TINY = dataclasses.replace(PROTOCOLS["smoke"], num_designs=4, first_episodes=2, 
 OPTIONS = options(dataclasses.replace(PROTOCOLS["smoke"], num_designs=7))
 IDLE_BESIDE = {
     **{word: {"--model-updates", "--model-cells"} for word in ("none", "simulator")},
-    "gradient": {"--num-particles", "--num-iterations"},
-    "fixed": {"--num-particles", "--num-iterations", "--num-start-states"},
-    "returns": {"--num-start-states"},
+    **{word: {"--num-particles", "--num-iterations"} for word in ("fixed", "gradient")},
 }
 
 

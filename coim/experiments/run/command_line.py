@@ -77,8 +77,7 @@ def refuse_idle_method(method: str | None, settings: Settings) -> None:
     Raises:
         ValueError: with a sentence.
     """
-    idle = without_effect(settings, called=option)
-    if method is not None and METHODS[method].keys() <= idle.keys():
+    if method is not None and "chosen_by" in without_effect(settings):
         raise ValueError(f"--method {method} has no effect with --bodies {settings.bodies}; leave it out")
 
 

@@ -10,17 +10,15 @@ if TYPE_CHECKING:
 
 SWARM = ("num_particles", "num_iterations", "swarm_bounds")
 MODEL = ("num_members", "model_cells", "model_lr", "weight_decay", "predict", "model_updates")
-VALUE = ("value_states", "value_over", "num_start_states")
 ROWS = ("mix", "imagined_states", "imagined_actions", "anchored", "governed")
 IMAGINATION = ("dream", "sigma", "imagined_share", "individual_imagined_share", *ROWS, *MODEL)
 # What has no effect, when, and the setting that decides it.
 RULES: tuple[tuple[tuple[str, ...], Callable[[Settings], bool], str], ...] = (
     (
-        ("search", "chosen_by", "reach", "widening", *VALUE, *SWARM),
+        ("search", "chosen_by", "reach", "widening", *SWARM),
         lambda settings: settings.bodies != "search",
         "bodies",
     ),
-    (VALUE, lambda settings: settings.chosen_by == "returns", "chosen_by"),
     (SWARM, lambda settings: settings.search == "gradient", "search"),
     (IMAGINATION, lambda settings: settings.imagine == "none", "imagine"),
     (("sigma",), lambda settings: settings.imagine != "noisy", "imagine"),

@@ -35,11 +35,6 @@ def test_an_arm_of_its_name_has_its_settings() -> None:
     [
         (["--method", "guessed"], "guessed"),
         (["--method", "grounded", "--bodies", "random"], "--method grounded has no effect with --bodies random"),
-        (["--bodies", "random", "--value-over", "visited"], "--value-over has no effect with --bodies random"),
-        (
-            ["--chosen-by", "returns", "--value-states", "matched"],
-            "--value-states has no effect with --chosen-by returns",
-        ),
     ],
 )
 def test_what_would_change_nothing_is_refused(words: list[str], sentence: str, capsys: pytest.CaptureFixture) -> None:
