@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from coim.experiments.pretrained import names
+
 ROOT = Path(__file__).parents[2]
 SOURCES = ("coim", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
 RUN = ["--preset", "quick", "--num-designs", "1", "--first-episodes", "1", "--episode-steps", "20", "--threads", "1"]
@@ -58,6 +60,13 @@ def test_the_command_lists_its_words_and_refuses_others(coim: Coim) -> None:
     unknown = coim("runn")
     assert (unknown.returncode, unknown.stdout) == (2, "")
     assert "there is no 'runn'; it must be one of run, resume, study" in unknown.stderr
+
+
+def test_the_trained_robots_come_with_it(coim: Coim) -> None:
+    there = coim("watch", "--pretrained", "ostrich")
+    assert (there.returncode, there.stdout) == (1, "")
+    assert "--pretrained is 'ostrich': there are" in there.stderr
+    assert all(name in there.stderr for name in names())
 
 
 def test_a_run_is_made_resumed_and_reported_from_another_folder(coim: Coim) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from coim.envs import MorphEnv
 from coim.events import DesignChosen, DesignDone, EpisodeDone
 from coim.experiments.run.build import episodes_of_designs, first_designs
+from coim.experiments.run.duration import in_words
 from coim.experiments.run.settings import Settings
 
 NEEDED = 2  # timed episodes before a sentence is said; the one before them compiles
@@ -132,10 +133,3 @@ class Forecast:
         """The same episodes, with other numbers of them and other learning after each; its searches are short."""
         learning = statistics.fmean(self._learning)
         return quick.episodes * (episode - learning + learning * quick.learning / max(1, self._left.learning))
-
-
-def in_words(seconds: float) -> str:
-    """A time as one would say it."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.{seconds < 36000:d}f} h"

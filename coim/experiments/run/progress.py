@@ -7,13 +7,16 @@ import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from typing import TextIO, TypeVar
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 import torch
 from torch import Tensor
 
 from coim.events import DesignChosen, DesignDone, EpisodeDone, running
-from coim.experiments.run.forecast import Forecast, in_words
+from coim.experiments.run.duration import in_words
+
+if TYPE_CHECKING:
+    from coim.experiments.run.forecast import Forecast  # with it come the searches, which a film does not need
 
 EVERY, EVERY_LIVE = 10.0, 0.2  # s between two lines of a piece of work
 PieceT = TypeVar("PieceT")

@@ -16,7 +16,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from coim.envs import BODIES
 from coim.experiments.run.build import episodes_of_designs
-from coim.experiments.run.forecast import in_words
+from coim.experiments.run.duration import in_words
 from coim.experiments.run.interrupt import sentence_of
 from coim.experiments.run.resume import resumed, still_finished
 from coim.experiments.run.settings import Settings

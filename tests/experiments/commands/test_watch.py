@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
 from tiny_runs import run
 
 from coim import TriedDesign, load_run, run_episode
-from coim.experiments.commands.watch import Watch, main
-from coim.experiments.drawing.film import Take, choose, film, labelled, side_by_side, take, write_film
+from coim.experiments.commands.watch import main
+from coim.experiments.drawing.film import choose, take
+from coim.experiments.drawing.footage import Take, labelled, side_by_side, write_film
 
 
 def tried(run: int, number: int, best_return: float) -> TriedDesign:
@@ -42,6 +44,7 @@ DONE = SimpleNamespace(
         ("all", 1, [(1, i) for i in (1, 2, 4, 5, 6)]),  # the third has no return
         ("6", None, [(0, 6)]),
         ("6", 1, [(1, 6)]),
+        ("5,1,2", None, [(1, 5), (1, 1), (1, 2)]),
     ],
 )
 def test_the_designs_that_are_asked_for(design: str, run: int | None, expected: list[tuple[int, int]]) -> None:
@@ -51,7 +54,8 @@ def test_the_designs_that_are_asked_for(design: str, run: int | None, expected: 
 @pytest.mark.parametrize(
     ("design", "run", "sentence"),
     [
-        ("worst", None, r"--design is 'worst': choose best, top5, all or one of .* \[1, 2, 3, 4, 5, 6\]"),
+        ("worst", None, r"--design is 'worst': choose best, top5, all or numbers of .* \[1, 2, 3, 4, 5, 6\]"),
+        ("3,1", 1, r"--design is '3,1': .* of run 1, \[1, 2, 4, 5, 6\]"),
         ("3", 1, r"--design is '3': .* of run 1, \[1, 2, 4, 5, 6\]"),  # the third has no return
         ("best", 2, "no design of run 2 in runs/a has a return yet"),
     ],
@@ -62,11 +66,16 @@ def test_a_design_that_is_not_there_is_refused(design: str, run: int | None, sen
 
 
 @pytest.mark.parametrize(
-    ("given", "sentence"), [({"width": 65}, "width is 65, it must be even"), ({"steps": 0}, "steps is 0")]
+    ("words", "sentence"),
+    [
+        (["--width", "65"], "width is 65, it must be even"),
+        (["--steps", "0"], "steps is 0"),
+        (["--pretrained", "hopper"], "name the folder of a run or --pretrained .*hopper.*, one of the two"),
+    ],
 )
-def test_a_size_that_cannot_be_filmed_is_refused(tmp_path: Path, given: dict[str, int], sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        next(film(**vars(Watch(folder=tmp_path, **given))))
+def test_what_cannot_be_filmed_is_refused(tmp_path: Path, words: list[str], sentence: str) -> None:
+    with pytest.raises(SystemExit, match=sentence):
+        main([str(tmp_path), *words])
 
 
 def test_a_folder_without_a_run_is_one_sentence(tmp_path: Path) -> None:
@@ -175,7 +184,7 @@ def test_a_run_without_its_policies_is_filmed_with_that_of_the_population(copied
     design = next(tried.design for tried in loaded.designs if tried.number == 2)
     alone = run_episode(loaded.bodies, loaded.population.policy, design=design[None], deterministic=True)
     assert shot.poses.shape == (61, 6)
-    assert shot.tried.design.equal(design)
+    assert shot.design.equal(design)
     assert abs(shot.poses[0, 1] - float(alone["observation"][0, 0, 0])) < 0.02  # another start of the same body
 
 
@@ -210,3 +219,30 @@ def test_without_a_way_to_draw_one_sentence_says_what_to_install(fleet: Path) ->
     assert said.returncode == 1
     assert said.stderr.splitlines()[-1].startswith("ImportError: MUJOCO_GL=osmesa names an OpenGL library")
     assert "apt-get install libegl1" in said.stderr
+
+
+def test_a_trained_robot_of_the_package_is_filmed_for_five_seconds_where_one_stands(
+    filmed: list, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("safetensors")
+    monkeypatch.chdir(tmp_path)
+    main(["--pretrained", "hopper"])
+    ((path, (shot,)),) = filmed
+    assert path == Path("hopper.mp4")
+    assert len(shot.poses) == 625 + 1  # steps of 0.008 s
+    assert shot.poses[-1, 0] > 2.0  # m: it moves forward
+    with pytest.raises(SystemExit, match=r"is one policy: leave out --run and --policy"):
+        main(["--pretrained", "hopper", "--run", "0"])
+    with pytest.raises(SystemExit, match=r"--pretrained is 'ostrich': there are .*hopper"):
+        main(["--pretrained", "ostrich"])
+
+
+def test_an_animated_picture_repeats_at_the_speed_at_which_it_happened(tmp_path: Path) -> None:
+    pictures = [np.full((32, 48, 3), 60 * i, np.uint8) for i in range(4)]
+    shot = SimpleNamespace(step_seconds=0.008, poses=np.zeros((28, 6)), frames=lambda stride: iter(pictures))
+    write_film(tmp_path / "film.webp", [shot])
+    with Image.open(tmp_path / "film.webp") as film:
+        assert (film.n_frames, film.size, film.info["loop"]) == (4, (48, 32), 0)
+        film.seek(1)
+        film.load()
+        assert film.info["duration"] == 72  # ms: every ninth step

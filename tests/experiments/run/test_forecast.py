@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from coim import DesignChosen, EpisodeDone, HopperMorph
-from coim.experiments.run.forecast import Forecast, Work, in_words, work_of
+from coim.experiments.run.duration import in_words
+from coim.experiments.run.forecast import Forecast, Work, work_of
 from coim.experiments.run.settings import PRESETS, QUICK, Settings
 
 EPISODE = EpisodeDone(
