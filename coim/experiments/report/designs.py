@@ -26,7 +26,7 @@ def best_returns(records: Sequence[Record]) -> Section:
     """Best return of each design, in the order in which they were built."""
     figure, (axes,) = new_figure(3.4)
     plot_over_designs(axes, records, "best_return")
-    axes.set(xlabel="design (number)", ylabel="best return of a design (1)")
+    axes.set(xlabel="design (number)", ylabel="best return of a design")
     explain(figure, records, kinds=True, more=cross_handles(records))
     tops = [
         f"{r.name}: highest {number(_top(r)['best_return'])} at design {_top(r)['design']}"
@@ -51,7 +51,7 @@ def designs_over_time(records: Sequence[Record], body: type[MorphEnv] | None) ->
         spread = [replace(r, designs=r.designs.assign(entry=designs_of(r.designs)[:, i])) for r in records]
         plot_over_designs(axes, spread, "entry")
         axes.set_title(name, loc="left", fontsize=10)
-        axes.set(ylabel="scale factor (1)")
+        axes.set(ylabel="scale factor")
         if body is not None:
             low, high = (float(bound[i]) for bound in body.design_bounds())
             margin = 0.06 * (high - low)
@@ -125,7 +125,7 @@ def predictions(records: Sequence[Record]) -> Section:
     if not axes.collections:
         note = "No design has both a prediction and a return yet: the first is built without one."
         return Section(title=title, notes=[note])
-    axes.set(xlabel=r"predicted value $Q(\xi)$ before the body was built, discounted (1)", ylabel="best return (1)")
+    axes.set(xlabel=r"predicted value $Q(\xi)$ before the body was built, discounted", ylabel="best return")
     explain(figure, records, kinds=True, mean=False)
     caption = (
         "Eq. 5 before anything was learnt on a body, against the best return on it. The scales differ (discounted "

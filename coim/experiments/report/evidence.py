@@ -101,7 +101,7 @@ def _drawn(found: Sequence[tuple[str, Estimate]]) -> Figure:
     axes.scatter([gain.value for _, gain in found], places, color=BLACK, s=22, zorder=2)
     axes.axvline(0, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
     axes.set_yticks(places, [literal(name) for name, _ in found])
-    axes.set(ylim=(len(found) - 0.4, -0.6), xlabel="best return of optimised bodies minus that of random ones (1)")
+    axes.set(ylim=(len(found) - 0.4, -0.6), xlabel="best return of optimised bodies minus that of random ones")
     return figure
 
 
@@ -117,7 +117,7 @@ def _over_designs(title: str, record: Record, notes: Sequence[str]) -> Section:
         mark_kinds(axes, rows, "best_return")
         outside = ~rows["best_return"].between(low, high)
         axes.scatter(rows["design"][outside], rows["best_return"][outside], **RINGED)
-        axes.set(ylabel="best return (1)", title=f"run {run}" if len(drawn) > 1 else "")
+        axes.set(ylabel="best return", title=f"run {run}" if len(drawn) > 1 else "")
         axes.locator_params(axis="x", integer=True)
         prefix = f"run {run}, " if record.num_runs > 1 else ""
         cells += _listed(rows, low, high, prefix)
@@ -151,7 +151,7 @@ def _against_each_other(title: str, records: Sequence[Record], notes: Sequence[s
         )
         mark_kinds(axes, rows, "best_return", colour, x="expected")
     _draw_equal(axes)
-    axes.set(xlabel="expected return before the body was built (1)", ylabel="best return (1)")
+    axes.set(xlabel="expected return before the body was built", ylabel="best return")
     explain(figure, records, kinds=True, mean=False)
     caption = (
         "Best return of each body against what the posterior over earlier returns expected before it was built, with "

@@ -57,7 +57,7 @@ def imagination(records: Sequence[Record]) -> Section | None:
     if len(records) == 1:
         for axes in grid:
             mark_builds(axes, records[0])
-    grid[-1].set(xlabel=f"{STEPS} (1)")
+    grid[-1].set(xlabel=STEPS)
     reasons = {reason for record in governed for reason in record.episodes["reason"]}
     marks = [
         Line2D([], [], color=colour, marker="x", linestyle="", label=words)
@@ -130,7 +130,7 @@ def _draw_share(axes: Axes, records: Sequence[Record]) -> None:
             rows = record.episodes[record.episodes["reason"] == reason]
             axes.scatter(rows["env_steps"], np.zeros(len(rows)), s=16, color=colour, marker="x", zorder=4)
     most = max(record.settings.get("imagined_share", 1.0) for record in governed)
-    axes.set(ylabel="imagined share\nof a batch (1)", ylim=(-0.06 * most, 1.06 * most))
+    axes.set(ylabel="imagined share\nof a batch", ylim=(-0.06 * most, 1.06 * most))
 
 
 def _reasons(governed: Sequence[Record], *, several: bool) -> Iterator[str]:

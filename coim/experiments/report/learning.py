@@ -28,10 +28,10 @@ from coim.experiments.report.page import Section
 from coim.experiments.run.records import Record, number
 
 LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
-    "loss_actor": "actor loss (1)",
+    "loss_actor": "actor loss",
     "loss_qvalue": "critic loss (1, squared)",
     "alpha_entropy": r"$\alpha\,\times$ entropy (nats)",
-    "loss_dynamics": "model loss, Eq. 6 (1)",
+    "loss_dynamics": "model loss, Eq. 6",
 }
 
 
@@ -52,7 +52,7 @@ def learning_curves(records: Sequence[Record]) -> Section:
         explain(figure, records, more=cross_handles(records))
     for record in records:
         mark_divergences(axes, record.diverged, "env_steps", "return")
-    axes.set(xlabel=f"{STEPS} (1)", ylabel="return of an episode (1)")
+    axes.set(xlabel=STEPS, ylabel="return of an episode")
     last = [f"{r.name}: {curves(r.episodes, 'env_steps', 'return').mean[-1:].round(2).tolist()}" for r in records]
     return Section(
         title="Learning curves",
@@ -71,7 +71,7 @@ def model_errors(records: Sequence[Record]) -> Section:
         mark_builds(axes, records[0])
     if not plot_over_steps(axes, records, "model_error"):
         return Section(title=title, notes=["No model was learnt."])
-    axes.set(xlabel=f"{STEPS} (1)", ylabel="squared error over\nvariance of changes (1)", yscale="log")
+    axes.set(xlabel=STEPS, ylabel="squared error over\nvariance of changes", yscale="log")
     low, high = axes.get_ylim()
     axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=LogLocator(subs=(3, 4, 6, 7, 8, 9)))
     axes.yaxis.set_major_formatter("{x:g}")
@@ -107,7 +107,7 @@ def losses(records: Sequence[Record]) -> Section:
         there = False
         for who, style in ({"model": {"linestyle": "-"}} if name == "loss_dynamics" else learners).items():
             there |= plot_over_steps(axes, weighted, f"{who}/{name}", faint=alone, **style)
-        axes.set(xlabel=f"{STEPS} (1)", ylabel=label)
+        axes.set(xlabel=STEPS, ylabel=label)
         axes.locator_params(axis="x", nbins=4)
         axes.set_visible(there)
         drawn |= there

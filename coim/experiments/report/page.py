@@ -49,6 +49,8 @@ class Section:
         alt: the same in numbers, for readers who cannot see the figure.
         notes: sentences in small print.
         tables: any number of tables, at most ten columns each; see `narrow`.
+        folded: whether a reader unfolds it first.
+        film: an mp4 in base64, or empty.
     """
 
     title: str
@@ -57,6 +59,8 @@ class Section:
     alt: str = ""
     notes: Sequence[str] = ()
     tables: Sequence[Table] = ()
+    folded: bool = False
+    film: str = ""
 
 
 class Svg(NamedTuple):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ from coim.experiments.report.imagined import imagination
 from coim.experiments.report.page import Section, Table, narrow, page
 from coim.experiments.run.atomic_write import dated_file, naming_out, write_whole
 from coim.experiments.run.records import Record, number, read_records
+
+MOST_OF_A_FILM = 10e6  # bytes; a larger one is not put into the page
 
 
 def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type[MorphEnv] | None = None) -> Path:
@@ -42,6 +46,8 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
     body = body or BODIES.get(records[0].environment)
     with mpl.rc_context(FONT):
         sections = sections_of(records, body)
+    if len(records) == 1:
+        sections[0] = replace(sections[0], film=film_of_best(folders[0], records[0]))
     title = f"{records[0].environment}: {', '.join(record.name for record in records)}"
     path = place_of(out, folders)
     with naming_out(path):
@@ -91,6 +97,18 @@ def best_bodies(record: Record) -> Section:
     if len(rows) > 1:
         rows.append([f"mean of {len(rows)} runs", number(best["best_return"].mean()), *[""] * (len(head) - 2)])
     return Section(title="Best bodies", notes=states([record]), tables=[*narrow(Table(head=head, rows=rows))])
+
+
+def film_of_best(folder: Path, record: Record) -> str:
+    """The film that ``coim watch`` made of the best body of all runs, in base64; empty without one below 10 MB."""
+    if record.best.empty:
+        return ""
+    place = int(record.best["best_return"].argmax())
+    run, design = int(record.best.index[place]), int(record.best["design"].iloc[place])
+    words = f"design-{design}.mp4"
+    films = [folder / "videos" / name for name in (words, f"run-{run}-{words}")]
+    found = [film for film in films if film.is_file() and film.stat().st_size < MOST_OF_A_FILM]
+    return base64.b64encode(found[0].read_bytes()).decode() if found else ""
 
 
 # Columns of the comparison: the name of each, and its text for a run folder. A new column is a line here.
@@ -161,7 +179,7 @@ def in_full(title: str, records: Sequence[Record], values: Sequence[Mapping[str,
     rows = [[name, *(plain(value.get(name)) for value in values)] for name in names]
     differing = frozenset(name for name, *cells in rows if len(set(cells)) > 1)
     table = Table(head=["", *(record.name for record in records)], rows=rows, marked=differing)
-    return Section(title=title, tables=[*narrow(table)])
+    return Section(title=title, tables=[*narrow(table)], folded=True)
 
 
 def plain(value: Any) -> str:

@@ -29,7 +29,7 @@ def draw_run(folder: Path, body: type[MorphEnv]) -> Path:
     record = read_record(folder, folder.name)
     figure, (returns, bodies) = plt.subplots(2, 1, figsize=(9, 7), height_ratios=[3, 2], layout="constrained")
     plot_over_designs(returns, [record], "best_return")
-    returns.set(xlabel="design (number)", ylabel="best return of a design (1)")
+    returns.set(xlabel="design (number)", ylabel="best return of a design")
     returns.spines[["top", "right"]].set_visible(False)
     explain(figure, [record], kinds=True, more=cross_handles([record]))
     # The best run's, as on the page: the first run may have diverged before it had many.

@@ -22,6 +22,7 @@ from coim.experiments.frames import designs_of
 from coim.experiments.report.designs import describe_correlation
 from coim.experiments.report.run_report import write_report
 from coim.experiments.run.records import read_record, read_records
+from tests.experiments.report.made_up_run import write_run
 
 VOID = {"meta", "img", "br"}
 PICTURES = ["Best return of each design", "Learning curves", "Designs over time", "Bodies", "Predicted and achieved"]
@@ -427,3 +428,14 @@ def browse(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[
     ]
     command = [str(CHROMIUM), *flags, f"--user-data-dir={folder / 'browser'}", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+
+
+def test_the_film_of_the_best_body_is_in_the_page_and_settings_are_folded(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", [1.0, 3.0, 2.0])
+    assert "<video" not in write_report([folder]).read_text()
+    (folder / "videos").mkdir()
+    (folder / "videos/design-1.mp4").write_bytes(b"another")
+    (folder / "videos/design-2.mp4").write_bytes(b"best")
+    text = write_report([folder]).read_text()
+    assert re.findall(r'src="data:video/mp4;base64,([^"]*)"', text) == [base64.b64encode(b"best").decode()]
+    assert re.findall(r"<summary><h2>(.*?)</h2></summary>", text) == ["Settings", "Versions and machine"]
