@@ -21,7 +21,7 @@ import tyro
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.networks import load
+from benchmarks.networks import FOLDER, load
 from coim import (
     DesignGenerator,
     DynamicsLearner,
@@ -212,7 +212,9 @@ def depths(measurement: Measurement) -> list[dict[str, Any]]:
         fleet = body(num_runs=measurement.num_bodies, episode_steps=measurement.episode_steps, seed=0)
         rng = torch.Generator().manual_seed(0)
         designs = RandomDesigns(fleet.design_spec)(torch.ones(measurement.num_bodies, body.DESIGN_SIZE), rng=rng)
-        policies = {"random actions": None} | ({"trained policy": load(name)[1]} if name != "walker" else {})
+        policies = {"random actions": None} | (
+            {"trained policy": load(name)[1]} if (FOLDER / f"{name}.pt").exists() else {}
+        )
         for told, policy in policies.items():
             rows = run_episode(fleet, policy, design=designs, rng=rng)
             depth = (-fleet.clearance(rows["observation"], rows["design"])).clamp(min=0).flatten()
