@@ -7,8 +7,11 @@ about 0.3 s, mostly to set up OpenGL, and each one of 640 x 480 pixels about 20 
 
 from __future__ import annotations
 
+import importlib
+import os
+import sys
 import warnings
-from typing import Self
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -20,6 +23,7 @@ PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJo
 # these and 40 ms with 1024 and MuJoCo's 4 samples, and looks the same.
 SHADOWS, SAMPLES = 512, 0
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
@@ -126,3 +130,21 @@ def _camera_number(model: mujoco.MjModel, name: str | None) -> int:
     if name is not None and name not in cameras:
         raise ValueError(f"CAMERA is {name!r}, and the file has the cameras {cameras}; choose one of them, or None")
     return 0 if name is None else cameras.index(name)
+
+
+def draw_without_screen() -> None:
+    """Let MuJoCo draw by EGL where there is no screen and nobody has chosen otherwise by ``MUJOCO_GL``.
+
+    MuJoCo reads ``MUJOCO_GL`` when it is imported, and ``import coim`` has done that: so it chooses once more.
+
+    Raises:
+        ImportError: if the library is not installed; the message says how to install it.
+    """
+    if sys.platform != "linux" or "MUJOCO_GL" in os.environ or any(os.environ.get(name) for name in SCREENS):
+        return
+    os.environ["MUJOCO_GL"] = "egl"
+    renderer: Any = sys.modules[mujoco.Renderer.__module__]  # where it lies differs between versions
+    try:
+        importlib.reload(renderer.gl_context)
+    except AttributeError as error:  # of PyOpenGL, which finds no such library
+        raise ImportError(MISSING_GL) from error

@@ -15,7 +15,7 @@ def test_tables_of_the_measurement(tmp_path: Path) -> None:
         )
     )
     found = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in tmp_path.glob("*.csv")}
-    assert {name: len(rows) for name, rows in found.items()} == {"foreseen": 2, "rows": 18, "floor": 5}
+    assert {name: len(rows) for name, rows in found.items()} == {"foreseen": 2, "rows": 18, "floor": 6}
     for row in found["rows"]:
         assert row["way"] == "as printed" or float(row["impossible"]) == 0
         if (row["designs"], row["way"], row["actions"]) == ("known", "matched, anchored", "replayed"):

@@ -24,7 +24,7 @@ else:
     with env.camera(0, width=160, height=120) as camera:
         places = (0.0, 0.5, 200.0, 1.99, 2.01)
         pictures = [camera.photograph(qpos + [x, *[0] * (len(qpos) - 1)]).astype(int) for x in places]
-        assert camera._model.vis.quality.shadowsize == 1024  # 4096 would double what a picture takes
+        assert camera._model.vis.quality.shadowsize == 512  # 4096 would double what a picture takes
     here, half, far, before, after = pictures
     assert (here == small).all()
     gym = GymnasiumEnv("HopperMorph", design=[0.5] * 4, reset_noise=0.0, render_mode="rgb_array", width=160, height=120)

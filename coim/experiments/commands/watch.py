@@ -9,21 +9,17 @@ comes with the package.
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import mujoco
 import tyro
 
-from coim.envs.camera import MISSING_GL
+from coim.envs.camera import draw_without_screen
 from coim.experiments.pretrained import names, policy_file
 from coim.experiments.run.interrupt import on_command_line
 
-SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")
 PRETRAINED_SECONDS = 5.0  # of simulated time, which is filmed in seconds
 
 
@@ -86,21 +82,3 @@ def source_of(asked: Watch) -> Path:
     if (asked.folder is None) == (asked.pretrained is None):
         raise ValueError(f"name the folder of a run or --pretrained {' | '.join(names())}, one of the two")
     return policy_file(asked.pretrained) if asked.folder is None else asked.folder
-
-
-def draw_without_screen() -> None:
-    """Let MuJoCo draw by EGL where there is no screen and nobody has chosen otherwise by ``MUJOCO_GL``.
-
-    MuJoCo reads ``MUJOCO_GL`` when it is imported, and ``import coim`` has done that: so it chooses once more.
-
-    Raises:
-        ImportError: if the library is not installed; the message says how to install it.
-    """
-    if sys.platform != "linux" or "MUJOCO_GL" in os.environ or any(os.environ.get(name) for name in SCREENS):
-        return
-    os.environ["MUJOCO_GL"] = "egl"
-    renderer: Any = sys.modules[mujoco.Renderer.__module__]  # where it lies differs between versions
-    try:
-        importlib.reload(renderer.gl_context)
-    except AttributeError as error:  # of PyOpenGL, which finds no such library
-        raise ImportError(MISSING_GL) from error
