@@ -112,7 +112,7 @@ class Comparison:
     seeds: tuple[int, ...] = (0, 1)
     """Five runs of each arm for each of them."""
     sizes: Settings = SIZES
-    """Of each run."""
+    """Settings of each run."""
 
 
 class SpoiltModel:

@@ -23,7 +23,7 @@ PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJo
 # these and 40 ms with 1024 and MuJoCo's 4 samples, and looks the same.
 SHADOWS, SAMPLES = 512, 0
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
-SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")
+SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display, on Linux
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
@@ -132,6 +132,11 @@ def _camera_number(model: mujoco.MjModel, name: str | None) -> int:
     return 0 if name is None else cameras.index(name)
 
 
+def has_screen() -> bool:
+    """Whether a display is named, on Linux; elsewhere there always is one."""
+    return sys.platform != "linux" or any(os.environ.get(name) for name in SCREENS)
+
+
 def draw_without_screen() -> None:
     """Let MuJoCo draw by EGL where there is no screen and nobody has chosen otherwise by ``MUJOCO_GL``.
 
@@ -140,7 +145,7 @@ def draw_without_screen() -> None:
     Raises:
         ImportError: if the library is not installed; the message says how to install it.
     """
-    if sys.platform != "linux" or "MUJOCO_GL" in os.environ or any(os.environ.get(name) for name in SCREENS):
+    if has_screen() or "MUJOCO_GL" in os.environ:
         return
     os.environ["MUJOCO_GL"] = "egl"
     renderer: Any = sys.modules[mujoco.Renderer.__module__]  # where it lies differs between versions

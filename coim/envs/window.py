@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 
 import mujoco
 import numpy as np
 
-from coim.envs.camera import PERIOD, dress
+from coim.envs.camera import PERIOD, SCREENS, dress, has_screen
 from coim.envs.root import Root
 
-SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display, on Linux
 PICTURE = 480  # pixels along a side of the off-screen buffer, which a window does not use
 
 
@@ -68,7 +65,7 @@ def refuse_without_display() -> None:
     Raises:
         RuntimeError: if no display is named, on Linux; elsewhere there always is one.
     """
-    if sys.platform == "linux" and not any(os.environ.get(name) for name in SCREENS):
+    if not has_screen():
         raise RuntimeError(
             f"a window needs a display, and none of {', '.join(SCREENS)} names one: take render_mode='rgb_array', "
             "which draws without one, or start it under a display such as xvfb-run"

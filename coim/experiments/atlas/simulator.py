@@ -3,7 +3,7 @@
 The package is not shipped with coim: it has 10 MB of WebAssembly. It is one download, and 2.5 MB when compressed.
 
 References:
-    The package @mujoco/mujoco on https://registry.npmjs.org, by Google DeepMind, Apache License 2.0.
+    The package @mujoco/mujoco of npm, by Google DeepMind, Apache License 2.0.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 NAME = "@mujoco/mujoco"
-FETCH = "npm pack @mujoco/mujoco, or curl -O https://registry.npmjs.org/@mujoco/mujoco/-/mujoco-3.14.0.tgz"
+FETCH = "npm pack @mujoco/mujoco"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -139,6 +139,9 @@ def test_films_move_at_the_speed_at_which_it_happened(fleet: Path) -> None:
     said = watch(fleet, "--design", "top5", "--run", "1", "--width", "96", "--height", "64")
     if "no picture without OpenGL" in said.stderr or "names an OpenGL library that is missing" in said.stderr:
         assert "libegl1 libegl-mesa0" in said.stderr
+        alone = [sys.executable, "-c", "import mujoco; mujoco.GLContext(8, 8).make_current()"]
+        drawn = subprocess.run(alone, env=os.environ | {"MUJOCO_GL": "egl"}, capture_output=True, check=False)
+        assert drawn.returncode != 0, "MuJoCo alone draws by EGL here"
         pytest.skip("there is no EGL to draw with")
     assert said.returncode == 0, said.stderr
     path = fleet / "videos" / "run-1-top5.mp4"

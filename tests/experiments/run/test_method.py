@@ -34,6 +34,7 @@ def test_an_arm_of_its_name_has_its_settings() -> None:
     ("words", "sentence"),
     [
         (["--method", "guessed"], "guessed"),
+        (["--widening", "0.1"], "--widening is 0.1 without a --reach that it could widen"),
         (["--method", "grounded", "--bodies", "random"], "--method grounded has no effect with --bodies random"),
     ],
 )

@@ -111,7 +111,7 @@ def test_a_script_finds_where_a_run_diverged(ill: Path) -> None:
 
 
 def test_a_design_that_a_diverged_run_never_had_is_not_offered_for_a_film(ill: Path) -> None:
-    with pytest.raises(ValueError, match=r"one of the designs that are done of run 1, \[1, 2\]"):
+    with pytest.raises(ValueError, match=r"numbers of the designs that are done of run 1, \[1, 2\]"):
         choose(load_run(ill), "3", 1)
 
 
