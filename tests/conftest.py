@@ -19,7 +19,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture(autouse=True)
 def same_draws() -> None:
     """Let a test that draws from torch's own generator draw the same after whatever ran before it."""
-    torch.manual_seed(0)
+    torch.manual_seed(4321)  # no seed of a generator in the tests, whose draws would be the same
 
 
 @pytest.fixture
