@@ -51,8 +51,13 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
         >>> quick(torch.zeros(2))
         tensor([0., 0.])
     """
-    slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options={"cpp_wrapper": device.type == "cpu"})
     quick: dict[Choice, Callable[P, R]] = {}
+
+    def compiled_for(*inputs: object) -> Callable[P, R]:
+        options: dict[str, Any] = {"cpp_wrapper": device.type == "cpu"}
+        with torch._dynamo.config.patch(enable_aot_compile=True):  # off by default in torch 2.11
+            slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options=options)
+            return slow.aot_compile(inputs)
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -60,7 +65,7 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
         if products not in quick:
             with _COMPILING:
                 if products not in quick:
-                    quick[products] = slow.aot_compile((args, kwargs))
+                    quick[products] = compiled_for(args, kwargs)
         return quick[products](*args, **kwargs)
 
     return call

@@ -71,7 +71,8 @@ class DesignChoice:
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``.
-        first_designs: ``[I, D]`` bodies that every run tries first, on the device of the bodies.
+        first_designs: ``[I, D]`` bodies that every run tries first, on the device of the bodies; ``[I, K, D]`` gives
+            each run bodies of its own.
         search: maximises Eq. 5; needed if ``bodies`` is ``"search"``.
         bodies: which come after the first ones. ``"search"`` is Algorithm 1, ``"random"`` never searches. ``"fixed"``
             takes the first of the first designs every time, from the start on: the same budget for one body.
@@ -208,16 +209,22 @@ class DesignChoice:
 
     def explore(self, situation: Situation) -> Tensor:
         """Uniform designs, ``[K, D]``: the exploration step of Algorithm 1."""
-        like = self.first_designs[:1].cpu().expand(situation.num_runs, -1)
+        like = self.first_designs[0].cpu().expand(situation.num_runs, -1)
         return RandomDesigns(self.spec)(like, rng=self.rng).to(self.first_designs.device)
 
     def check_fits(self, env: MorphEnv) -> None:
         """Refuse to choose among designs that the bodies cannot have.
 
         Raises:
-            ValueError: if this one's bounds leave those of the bodies or are on another device, or states are to be
-                matched and the bodies cannot tell how high they stand.
+            ValueError: if this one's bounds leave those of the bodies or are on another device, there are first designs
+                for another number of runs, or states are to be matched and the bodies cannot tell how high they stand.
         """
+        runs = env.batch_size.numel()
+        if self.first_designs.ndim == 3 and self.first_designs.shape[1] != runs:
+            raise ValueError(
+                f"first_designs has shape {list(self.first_designs.shape)}, bodies for {self.first_designs.shape[1]} "
+                f"runs, and env has {runs}; pass [I, D] for all runs, or [I, {runs}, D]"
+            )
         _check_within("design_choice chooses", self.spec, env.design_spec)
         if self.value_states == "matched":
             check_transfer(env)
@@ -260,9 +267,10 @@ def _check_first_designs(spec: Bounded, first_designs: Tensor) -> None:
     if not isinstance(first_designs, Tensor):
         raise TypeError(f"first_designs is a {type(first_designs).__name__}; pass a Tensor")
     low, high = spec.space.low, spec.space.high
-    if first_designs.ndim != 2 or first_designs.shape[1:] != spec.shape or not len(first_designs):
+    if first_designs.ndim not in (2, 3) or first_designs.shape[-1:] != spec.shape or not first_designs.numel():
         raise ValueError(
-            f"first_designs has shape {list(first_designs.shape)}, expected [I, {spec.shape[0]}] with at least one row"
+            f"first_designs has shape {list(first_designs.shape)}, expected [I, {spec.shape[0]}], or "
+            f"[I, K, {spec.shape[0]}] for K runs, with at least one row"
         )
     if first_designs.device != low.device or first_designs.dtype != spec.dtype:
         raise ValueError(

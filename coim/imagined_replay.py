@@ -162,7 +162,7 @@ class ImaginedReplay:
             env: the bodies.
             art: Replay_Art, from which learners draw.
             dynamics: learner of the model, or None.
-            first_designs: ``[I, D]``, on which G is tried.
+            first_designs: ``[I, D]`` or ``[I, K, D]``, on which G is tried.
 
         Raises:
             ValueError: if the dream steps another ensemble than the one that learns or one that has learnt nothing, is
@@ -247,7 +247,7 @@ def _check_rewards(env: MorphEnv, dream: WorldModelEnv) -> None:
 def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: Tensor) -> None:
     """Try G on the first designs and on two corners; torch's global generators stay as they are."""
     low, high = env.design_spec.space.low, env.design_spec.space.high
-    tried = torch.cat([first_designs, low[None], high[None]]).repeat(TRIES, 1)
+    tried = torch.cat([first_designs.flatten(0, -2), low[None], high[None]]).repeat(TRIES, 1)
     tried = tried.unsqueeze(1).expand(-1, env.batch_size.numel(), -1)  # [N, K, D]
     with torch.random.fork_rng(devices=[tried.device] if tried.device.type == "cuda" else []):
         found = generator(tried.clone(), rng=torch.Generator(tried.device).manual_seed(0))

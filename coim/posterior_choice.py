@@ -29,7 +29,7 @@ class PosteriorChoice(DesignChoice):
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``.
-        first_designs: ``[I, D]`` bodies that every run tries first.
+        first_designs: ``[I, D]`` bodies that every run tries first, or ``[I, K, D]``.
         critic: whether Eq. 5 is the mean of the process, as far as it ranks the bodies tried; without it this is plain
             Bayesian optimisation of returns.
         others: keywords of `DesignChoice`. ``value_states="matched"`` and ``value_over="visited"`` give a critic that

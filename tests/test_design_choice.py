@@ -119,6 +119,17 @@ def test_the_states_of_all_designs_and_the_present_bodies_are_there() -> None:
     assert torch.equal(last.present, algorithm.position.tried[-1].design)
 
 
+def test_each_run_may_have_first_bodies_of_its_own() -> None:
+    bodies = torch.tensor([[[0.6, 1.0, 1.0, 1.0], [1.0, 1.4, 1.0, 2.0]]])  # [I, K, D]
+    algorithm = small(2, imagine=False, first_designs=bodies, num_designs=2)
+    chosen = [event.design for event in algorithm if isinstance(event, DesignChosen)]
+    assert torch.equal(chosen[0], bodies[0])
+    assert torch.equal(algorithm.buffers.pop[0]["design"], bodies[0])
+    assert not torch.equal(chosen[1], bodies[0])
+    with pytest.raises(ValueError, match=r"shape \[1, 2, 4\], bodies for 2 runs, and env has 3; pass .* \[I, 3, D\]"):
+        small(3, imagine=False, first_designs=bodies)
+
+
 def test_random_designs_have_numbers_of_their_own() -> None:
     algorithm = small(2, bodies="random", seed=3)
     found = [event.design for event in algorithm if isinstance(event, DesignChosen) and event.kind == "random"]

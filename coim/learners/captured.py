@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
+
+# One graph repeats so many updates: launched one by one, small networks wait for Python between them.
+PER_GRAPH = 50
 
 
 class FlatAdam(torch.optim.Adam):
@@ -43,11 +45,59 @@ class FlatAdam(torch.optim.Adam):
         )
 
 
+class Graph:
+    """A function of tensors on CUDA that is called once, captured in the second call and replayed from then on.
+
+    Whatever is made once, such as Adam's moments, is made in the first call. (`tensordict.nn.CudaGraphModule` does the
+    same for any function; its first use takes TensorDict out of torch's PyTree for good, for all code in the process.)
+
+    Args:
+        function: does the same operations in each call, on tensors of the same sizes, and returns a tensor. It changes
+            other tensors in place only.
+        device: of all tensors.
+    """
+
+    def __init__(self, function: Callable[..., Tensor], *, device: torch.device) -> None:
+        self._function, self._device = function, device
+        self._warm = False
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self, *inputs: Tensor) -> Tensor:
+        with torch.cuda.device(self._device):
+            if not self._warm:
+                return self._call_aside(inputs)
+            if self._graph is None:
+                self._capture(inputs)
+            else:
+                torch._foreach_copy_(self._inputs, list(inputs))
+            assert self._graph is not None
+            self._graph.replay()
+            return self._output.clone()
+
+    def _call_aside(self, inputs: Iterable[Tensor]) -> Tensor:
+        """Call on another stream, as `torch.cuda.CUDAGraph` asks for: libraries make their workspaces then."""
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(here)
+        with torch.cuda.stream(aside):
+            output = self._function(*inputs)
+        here.wait_stream(aside)
+        self._warm = True
+        return output
+
+    def _capture(self, inputs: Iterable[Tensor]) -> None:
+        self._inputs = [x.clone() for x in inputs]
+        graph = torch.cuda.CUDAGraph()
+        # What other threads of the process do on the device is none of this graph's.
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            self._output = self._function(*self._inputs)
+        self._graph = graph
+
+
 class FlatUpdates:
-    """Updates by Adam over one flat buffer of weights; on CUDA one is captured as a graph and replayed.
+    """Updates by Adam over one flat buffer of weights; on CUDA they are captured as a graph and replayed.
 
     A graph repeats the operations that it has recorded. A number that may change between two calls is therefore read
-    from a tensor, as the learning rate is; after any other change the next update is captured anew.
+    from a tensor, as the learning rate is; after any other change the next updates are captured anew.
 
     Args:
         update: computes gradients from the tensors of one batch, writes them into ``weights.grad``, calls
@@ -66,42 +116,54 @@ class FlatUpdates:
     ) -> None:
         assert weights.grad is not None
         self._weights, self._gradient = weights, weights.grad
-        self._update = self._step = update
+        self._update = update
         self.captures = captures(weights.device)
         # Adam's fused kernel on CUDA reads it in float32, whatever the weights are.
         self._lr = torch.tensor(lr, dtype=torch.float32, device=weights.device) if self.captures else lr
+        self._graphs: dict[tuple[torch.Size, ...], Graph] = {}
         self._captured: object = None
         self.optimiser = (torch.optim.Adam if self.captures else FlatAdam)(
             [weights], lr=self._lr, weight_decay=weight_decay, fused=True, capturable=self.captures
         )
 
-    def mean(self, batches: Iterable[Sequence[Tensor]]) -> Tensor:
-        """Do one update with the tensors of each batch, and return the mean of what the updates return."""
-        batches = list(batches)
-        sizes = [tensor.shape for tensor in batches[0]]
-        self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
-        if self.captures:
-            self._renew(sizes)
-        with torch.cuda.device_of(self._weights):  # a graph is captured on the current device
-            mean = torch.stack([self._step(*rows) for rows in batches]).mean(0)
-        if self.captures:
-            self._captured = self._constants(sizes)
-        return mean
+    def mean(self, batches: Iterable[Tensor]) -> Tensor:
+        """Do an update with each batch, and return the mean of what the updates return.
 
-    def _renew(self, sizes: list[torch.Size]) -> None:
-        """Write a new learning rate where the graph reads it; drop a graph of other sizes, settings or moments."""
+        Args:
+            batches: tensors ``[U, ...]``, the same rows of each are a batch.
+        """
+        self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
+        if not self.captures:
+            return self._one_by_one(*batches).mean(0)
+        self._renew()
+        parts = [self._graph(part)(*part) for part in zip(*(x.split(PER_GRAPH) for x in batches))]
+        self._captured = self._constants()
+        return torch.cat(parts).mean(0)
+
+    def _one_by_one(self, *batches: Tensor) -> Tensor:
+        return torch.stack([self._update(*rows) for rows in zip(*batches)])
+
+    def _graph(self, batches: Iterable[Tensor]) -> Graph:
+        """The graph for batches of these sizes, so many of them."""
+        sizes = tuple(x.shape for x in batches)
+        if sizes not in self._graphs:
+            self._graphs[sizes] = Graph(self._one_by_one, device=self._weights.device)
+        return self._graphs[sizes]
+
+    def _renew(self) -> None:
+        """Write a new learning rate where the graphs read it; drop graphs of other settings or moments."""
         group = self.optimiser.param_groups[0]
         if group["lr"] is not self._lr:
             self._lr.copy_(torch.as_tensor(group["lr"]))  # type: ignore[union-attr]
             group["lr"] = self._lr
-        if self._captured != self._constants(sizes):
-            self._step = CudaGraphModule(self._update, device=self._weights.device)
+        if self._captured != self._constants():
+            self._graphs.clear()
 
-    def _constants(self, sizes: list[torch.Size]) -> tuple[Any, ...]:
-        """List what a graph assumes: sizes, where the moments lie, all settings but the learning rate."""
+    def _constants(self) -> tuple[Any, ...]:
+        """List what a graph assumes: where the moments lie, all settings but the learning rate."""
         moments = [moment.data_ptr() for moment in self.optimiser.state.get(self._weights, {}).values()]
         settings = self.optimiser.param_groups[0].items()
-        return sizes, moments, {name: value for name, value in settings if name not in ("params", "lr")}
+        return moments, {name: value for name, value in settings if name not in ("params", "lr")}
 
 
 def captures(device: torch.device) -> bool:

@@ -142,7 +142,7 @@ class DynamicsLearner(FlatLearner):
         """
         batches = by_update(batches, self.num_runs)
         self.check_networks_lie_here()
-        mean = self._updates.mean(zip(*self._arrange(self._taken(batches))))
+        mean = self._updates.mean(self._arrange(self._taken(batches)))
         return TensorDict({"loss_dynamics": mean}, mean.shape)
 
     def _taken(self, rows: TensorDictBase) -> TensorDictBase:

@@ -163,7 +163,7 @@ class SACLearner(FlatLearner):
         noise = self._noise(batches["action"]), self._noise(batches["action"])
         scaling = self.policy.network.scaling
         rows = sac_batch(batches, noise, scaling=scaling, mix=self.loss.mix, num_runs=self.num_runs)
-        means = self._updates.mean([x[u] for x in rows] for u in range(len(batches)))
+        means = self._updates.mean(rows)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
 
     def _update_once(self, *rows: Tensor) -> Tensor:

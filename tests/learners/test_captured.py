@@ -57,7 +57,7 @@ class Recording(TorchDispatchMode):
 def recordings(monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
     """Let learners on the CPU capture their updates, as those on CUDA do."""
     monkeypatch.setattr(Recording, "made", [])
-    monkeypatch.setattr(coim.learners.captured, "CudaGraphModule", Recording)
+    monkeypatch.setattr(coim.learners.captured, "Graph", Recording)
     monkeypatch.setattr(coim.learners.captured, "captures", lambda device: True)
     return Recording.made
 
@@ -117,11 +117,13 @@ EACH += [(sac, change) for change in OF_SAC]
 
 
 def changed_midway(learner: Any, change: Any, batches: TensorDict) -> dict[str, Tensor]:
-    """Weights, and targets of critics, after five updates, a change and five more."""
-    learner.update(batches[:5])
+    """Weights, and targets of critics, after updates, a change and more updates: called, captured, replayed."""
+    for _ in range(3):
+        learner.update(batches[:5])
     before = learner.state_dict()["weights"].clone()
     change(learner)
-    learner.update(batches[5:])
+    for _ in range(3):
+        learner.update(batches[5:])
     state = learner.state_dict()
     assert not torch.equal(state["weights"], before)
     return {name: value.cpu() for name, value in state.items() if isinstance(value, Tensor) and name != "rng"}
@@ -160,9 +162,25 @@ def test_updates_are_captured_once_on_the_device_of_the_weights(
 @pytest.mark.parametrize("make", [sac, dynamics])
 def test_batches_of_another_size_are_captured_anew(make_rows: Rows, recordings: list[Recording], make: Any) -> None:
     learner = make()
-    for size in (8, 1, 8):  # a graph's copy of its input would repeat the one row eight times
+    for size in (8, 8, 1, 1, 8):  # a graph's copy of its input would repeat the one row eight times
         learner.update(make_rows(3, size, 1))
-    assert [recording.rows[0].shape[-2] for recording in recordings] == [8, 1, 8]
+    assert [recording.rows[0].shape[-2] for recording in recordings] == [8, 1]
+
+
+@pytest.mark.parametrize("make", [sac, dynamics])
+def test_many_updates_are_graphs_of_fifty_and_one_of_what_is_left(
+    make_rows: Rows, recordings: list[Recording], monkeypatch: pytest.MonkeyPatch, make: Any
+) -> None:
+    batches = make_rows(120, 8)
+    captured = make()
+    found = [captured.update(batches) for _ in range(2)]
+    assert [len(recording.rows[0]) for recording in recordings] == [50, 20]
+    monkeypatch.undo()
+    plain = make()
+    expected = [plain.update(batches) for _ in range(2)]
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.to_dict(), other.to_dict())
+    assert torch.equal(captured.state_dict()["weights"], plain.state_dict()["weights"])
 
 
 def test_updates_are_captured_on_cuda_alone() -> None:

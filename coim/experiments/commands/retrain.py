@@ -26,7 +26,7 @@ from coim.experiments.run.interrupt import locked, on_command_line, stopping_at_
 from coim.experiments.run.machine import available_cores
 from coim.experiments.study.cluster import ray_running, without_words_of_ray
 from coim.experiments.study.ray_scheduler import Conductor, Resources, refuse_lack, take_up
-from coim.experiments.study.retraining import Retrain, Retraining, cell_of, choose
+from coim.experiments.study.retraining import Retrain, Retraining, cells_of, choose
 from coim.experiments.study.runs import CHOSEN, read_runs
 
 DEFAULT = ", as the study gave to a first design (the paper: 300); --episodes takes another number"
@@ -57,14 +57,14 @@ def retrain(asked: Retrain) -> list[str]:
     runs = read_runs(asked.study)
     with locked(folder):
         chosen = choose(runs, folder / CHOSEN.file, asked)
-        cells = [cell_of(line, asked) for line in rows_of(chosen)]
+        cells = cells_of(rows_of(chosen), asked)
         resources = Resources(gpus=asked.gpus)
         try:
             ledger = take_up(folder, cells, resources)
         except ValueError as error:
             raise ValueError(f"{error}; or move {folder} away to choose and train anew") from None
         waiting = len(ledger.in_state("waiting"))
-        print(f"{waiting} of {len(cells)} designs to train -> {folder}")
+        print(f"{waiting} of {len(cells)} {'designs' if len(cells) == len(chosen) else 'fleets'} to train -> {folder}")
         if not waiting:
             return []
         print(f"{episodes_in_words(cells)} training episodes on each{'' if asked.episodes else DEFAULT}")
@@ -82,7 +82,7 @@ def check(asked: Retrain) -> None:
     """Refuse what cannot be done."""
     if asked.top is not None and not 0 < asked.top <= 1:
         raise ValueError(f"--top is {asked.top}, a share of the designs lies in (0, 1]; Fig. 2 has 0.5")
-    for name, least in (("most", 1), ("episodes", 1), ("workers", 0), ("gpus", 0)):
+    for name, least in (("most", 1), ("episodes", 1), ("together", 1), ("workers", 0), ("gpus", 0)):
         if (value := getattr(asked, name)) is not None and value < least:
             raise ValueError(f"--{name} is {value}, it must be at least {least}")
     if asked.workers and asked.ray_address is not None:

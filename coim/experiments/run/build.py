@@ -163,9 +163,16 @@ def make_dream(
     return learner, WorldModelEnv(ensemble, env, batch_size=env.batch_size)
 
 
-def first_designs(body: type[MorphEnv], settings: Settings) -> Sequence[Sequence[float]]:
-    """Bodies that every run tries first: those of the environment, or the one that is asked for."""
-    return [settings.first_design] if settings.first_design else body.FIRST_DESIGNS
+def first_designs(body: type[MorphEnv], settings: Settings) -> Sequence[Sequence[float]] | list[list[list[float]]]:
+    """Bodies that every run tries first: those of the environment, or the one that is asked for, or one for each run.
+
+    Returns:
+        ``[I][D]``, or ``[1][K][D]`` where each run has its own.
+    """
+    asked, size = settings.first_design, body.DESIGN_SIZE
+    if len(asked) > size and len(asked) == size * settings.num_runs:
+        return [[list(asked[i : i + size]) for i in range(0, len(asked), size)]]
+    return [asked] if asked else body.FIRST_DESIGNS
 
 
 def episodes_of_designs(body: type[MorphEnv], settings: Settings) -> list[int]:

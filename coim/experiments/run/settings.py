@@ -50,7 +50,8 @@ class Settings:
     bodies: Literal["search", "random", "fixed"] = "search"
     """Bodies after the first ones: optimised and random in turn, all random, or always the first one."""
     first_design: Annotated[tuple[Positive, ...], LISTS] = ()
-    """First body, as scale factors, in place of the environment's own first bodies."""
+    """First body, as scale factors, in place of the environment's own first bodies; or, one after the other, a body for
+    each of --num-runs."""
     sigma: NonNegative = 0.1
     """Standard deviation of the noise of --imagine noisy, in scale factors (Sec. 6.4)."""
     seed: Amount = 0

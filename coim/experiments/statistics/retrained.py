@@ -34,7 +34,7 @@ from coim.experiments.frames import at, read_frame, rows_of
 from coim.experiments.statistics.intervals import CONFIDENCE, RESAMPLES, SEED, holm
 from coim.experiments.statistics.measures import welch
 from coim.experiments.study.arms import in_order, pairs_of_arms
-from coim.experiments.study.runs import CHOSEN, Place, Run, runs_of_folder
+from coim.experiments.study.runs import CHOSEN, Place, Run, runs_of_folder, trained_in
 
 TESTS = ("welch_designs_p", "welch_runs_p")
 
@@ -127,10 +127,9 @@ def results(folder: Path, listed: pd.DataFrame) -> tuple[pd.DataFrame, int]:
     rows = [
         result(line, run)
         for line in rows_of(listed)
-        for run in runs_of_folder(
-            folder / "cells" / line["folder"], line["environment"], line["task"], line["arm"], line["seed"]
-        )
-        if run.over
+        for name, place in [trained_in(line)]
+        for run in runs_of_folder(folder / "cells" / name, line["environment"], line["task"], line["arm"], line["seed"])
+        if run.over and run.number == place
     ]
     if not rows:
         return pd.DataFrame(), 0

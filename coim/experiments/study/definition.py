@@ -216,7 +216,9 @@ def refuse_unbuildable(cell: Cell) -> None:
     """
     design, body = cell.settings.first_design, BODIES[cell.environment]
     low, high = (bound.tolist() for bound in body.design_bounds())
-    fits = len(design) == body.DESIGN_SIZE and all(x <= factor <= y for x, factor, y in zip(low, design, high))
+    bounds = itertools.cycle(zip(low, high))
+    sizes = (body.DESIGN_SIZE, body.DESIGN_SIZE * cell.settings.num_runs)  # one for all runs, or one for each
+    fits = len(design) in sizes and all(x <= factor <= y for factor, (x, y) in zip(design, bounds))
     if design and not fits:
         raise ValueError(
             f"first_design is {design}, a design of {cell.environment} has {body.DESIGN_SIZE} scale factors from "

@@ -6,13 +6,27 @@ from coim.experiments.study.definition import Block, Study
 
 SEEDS = tuple(range(10))
 # A method is developed on the first seeds and confirmed on the others, by which nothing may be chosen.
-DEVELOP, CONFIRM = tuple(range(5)), tuple(range(20, 30))
+DEVELOP, CONFIRM, FLEET = tuple(range(5)), tuple(range(20, 30)), tuple(range(30, 40))
 
 
 def bodies(name: str, seeds: tuple[int, ...]) -> Study:
     """Ways of choosing bodies, all without imagination."""
     arms = ("none", "random-bodies", "matched", "visited", "returns", "posterior", "grounded")
     return Study(name=name, environments=("hopper",), arms=arms, seeds=seeds, protocol="pilot")
+
+
+def bodies_in_fleets() -> Study:
+    """Ways of choosing bodies on seeds of their own, ten runs in lock-step in each cell for a GPU, on three bodies."""
+    return Study(
+        name="bodies-fleet",
+        environments=("hopper",),
+        arms=("none", "random-bodies", "returns", "grounded"),
+        seeds=FLEET,
+        protocol="pilot",
+        seeds_per_cell=len(FLEET),
+        overrides={"compile": False, "checkpoint_every": 6},
+        blocks=(Block(environments=("half_cheetah", "walker"), arms=("none", "grounded"), seeds=FLEET),),
+    )
 
 
 def imagining(name: str, seeds: tuple[int, ...]) -> Study:
@@ -56,6 +70,7 @@ STUDIES = {
         ),
         bodies("bodies-develop", DEVELOP),
         bodies("bodies", CONFIRM),
+        bodies_in_fleets(),
         imagining("imagining-develop", DEVELOP),
         imagining("imagining", CONFIRM),
         Study(

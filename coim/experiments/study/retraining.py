@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -19,7 +20,7 @@ from coim.experiments.run.atomic_write import as_csv, shortest, write_whole
 from coim.experiments.run.last_words import plain_sac
 from coim.experiments.run.resume import saved_settings
 from coim.experiments.study.definition import Cell
-from coim.experiments.study.runs import CHOSEN, Place, Run, Runs
+from coim.experiments.study.runs import CHOSEN, Place, Run, Runs, trained_in
 
 RULE: dict[str, Any] = {"top": 0.5, "most": 18, "of": "optimised"}  # of Fig. 2
 WORDS = {"optimised": "an optimised design", "all": "a design"}
@@ -42,6 +43,9 @@ class Retrain:
     have some too. With --most 1 the best body of each run. By default as before, or optimised (Fig. 2)."""
     episodes: int | None = None
     """Training episodes on each; by default as many as the study gave to a first design."""
+    together: int = 1
+    """Designs of an arm that are trained in lock-step in one process, which a GPU does in about the time of one.
+    What was chosen before stays as it is."""
     workers: int = 0
     """Designs at once on this machine, each on one core; 0 takes as many as there are cores."""
     ray_address: str | None = None
@@ -52,10 +56,10 @@ class Retrain:
 
 @dataclass(frozen=True)
 class Retraining(Cell):
-    """A design that is trained from scratch.
+    """A design that is trained from scratch, or several together.
 
     Attributes:
-        folder: named after the cell, the run and the design that it comes from.
+        folder: named after the cell, the run and the design that it comes from, or after the arm.
     """
 
     folder: str
@@ -89,7 +93,8 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> pd.DataFrame:
     tables = [listed]
     for place in runs.places:
         there = {*at(listed, place)["arm"]}
-        tables += [best_designs(runs, place, arm, rule) for arm in arms if arm not in there]
+        found = [best_designs(runs, place, arm, rule) for arm in arms if arm not in there]
+        tables += [in_fleets(lines, asked.together) for lines in found if len(lines)]
     tables = [table for table in tables if len(table)]
     if not tables:
         raise ValueError(
@@ -152,7 +157,7 @@ def best_designs(runs: Runs, place: Place, arm: str, rule: Mapping[str, Any]) ->
     noted |= {"found": sum(map(len, found)), "kept": len(kept)}
     ranked = kept.sort_values("found_return", ascending=False, kind="stable", ignore_index=True)
     noted |= {name: rule[name] for name in ("top", "most")}
-    return ranked.assign(**{name: float(value) for name, value in noted.items()}, of=rule["of"])
+    return ranked.assign(**{name: float(value) for name, value in noted.items()}, of=rule["of"], trained="")
 
 
 def candidates(run: Run, of: str) -> pd.DataFrame:
@@ -176,15 +181,45 @@ def candidates(run: Run, of: str) -> pd.DataFrame:
     )
 
 
-def cell_of(line: Mapping[str, Any], asked: Retrain) -> Retraining:
-    """Plain SAC on one body: the settings of the cell that found it, less population, imagination and search."""
-    settings = saved_settings(asked.study / "cells" / line["cell"])
-    settings = plain_sac(
-        settings,
-        [float(xi) for xi in line["xi"].split()],
-        first_episodes=settings.first_episodes if asked.episodes is None else asked.episodes,
-        seed=zlib.crc32(line["folder"].encode()),  # of its own, so that no two samples share initial weights
-        device="cpu",
-        quiet=True,
-    )
-    return Retraining(line["environment"], line["arm"], settings, 0, line["folder"])
+def in_fleets(lines: pd.DataFrame, size: int) -> pd.DataFrame:
+    """Designs of one arm in one place, each with the run that trains it if that is one of several in lock-step."""
+    if size == 1:
+        return lines
+    places = [divmod(number, size) for number in range(len(lines))]
+    names = lines["environment"] + "-" + lines["task"] + "-" + lines["arm"]
+    return lines.assign(trained=[f"{name}-fleet{fleet}/{run}" for name, (fleet, run) in zip(names, places)])
+
+
+def cells_of(lines: Iterable[Mapping[str, Any]], asked: Retrain) -> list[Retraining]:
+    """What trains these designs: a run for each, or for each fleet."""
+    by_folder: dict[str, list[Mapping[str, Any]]] = {}
+    for line in lines:
+        by_folder.setdefault(trained_in(line)[0], []).append(line)
+    return [cell_of(folder, own, asked) for folder, own in by_folder.items()]
+
+
+def cell_of(folder: str, lines: Sequence[Mapping[str, Any]], asked: Retrain) -> Retraining:
+    """Plain SAC on these bodies: the settings of the cells that found them, less population, imagination and search.
+
+    Raises:
+        ValueError: if bodies that are to be trained together were found with different settings.
+    """
+    each = [
+        plain_sac(
+            saved_settings(asked.study / "cells" / line["cell"]),
+            [float(xi) for line in lines for xi in line["xi"].split()],
+            num_runs=len(lines),
+            seed=zlib.crc32(folder.encode()),  # of its own, so that no two samples share initial weights
+            device="cpu",
+            quiet=True,
+        )
+        for line in lines
+    ]
+    if unlike := next((line["cell"] for line, settings in zip(lines, each) if settings != each[0]), None):
+        raise ValueError(
+            f"the designs of {folder} cannot be trained together: cell {unlike} has other settings than "
+            f"{lines[0]['cell']}; choose anew with --together 1, after deleting {asked.study}/retrained"
+        )
+    episodes = each[0].first_episodes if asked.episodes is None else asked.episodes
+    settings = dataclasses.replace(each[0], first_episodes=episodes)
+    return Retraining(lines[0]["environment"], lines[0]["arm"], settings, 0, folder)

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,10 +46,17 @@ CHOSEN = Layout(  # what ``coim retrain`` has chosen to train from scratch, in `
         "top": float,
         "most": float,
         "of": str,
+        "trained": str,  # FOLDER/RUN that trains it, if in lock-step with others; else by itself, in its own folder
     },
     needed=("folder", "cell", "environment", "task", "arm", "seed", "run", "design", "xi", "found_return"),
     grows=False,
 )
+
+
+def trained_in(line: Mapping[str, Any]) -> tuple[str, int]:
+    """The folder that trains a design, given its line of `CHOSEN`, and the number of its run there."""
+    folder, _, run = str(line["trained"]).rpartition("/")
+    return (folder, int(run)) if folder else (line["folder"], 0)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from coim.experiments.commands.retrain import episodes_in_words, main
 from coim.experiments.frames import read_frame
 from coim.experiments.run.command_line import parse
 from coim.experiments.run.settings import Settings, plain
-from coim.experiments.study.retraining import Retrain, best_designs, cell_of, choose
+from coim.experiments.study.retraining import Retrain, best_designs, cells_of, choose
 from coim.experiments.study.runs import CHOSEN, read_runs
 from tests.experiments.made_up_study import write_cell
 
@@ -140,13 +140,13 @@ def test_a_retraining_has_the_settings_of_its_cell_but_for_what_is_not_sac_on_on
     cell = "hopper-forward-known-0"
     settings = settings_of(study, cell, dream="simulator", bodies="random", num_runs=3)
     lines = best_designs(read_runs(study), PLACE, "known", RULE)[1:3].to_dict("records")
-    own = cell_of(lines[0], Retrain(study=study, episodes=9)).settings
+    own = cells_of(lines[:1], Retrain(study=study, episodes=9))[0].settings
     assert (own.imagine, own.dream, own.population_updates, own.model_updates) == ("none", "ensemble", 0, 0)
     assert (own.individual_imagined_share, own.num_designs, own.num_runs) == (0, 1, 1)
     assert (own.first_design, own.first_episodes) == ((0.75, 1), 9)
     assert (own.lr, own.batch_size, own.individual_updates) == (0.001, settings.batch_size, settings.individual_updates)
     settings_of(study, "hopper-forward-known-2")
-    other = cell_of(lines[1], Retrain(study=study)).settings
+    other = cells_of(lines[1:], Retrain(study=study))[0].settings
     assert own.seed != other.seed
     assert other.first_episodes == settings.first_episodes
 
@@ -155,8 +155,24 @@ def test_it_is_told_how_many_episodes_each_design_will_have(study: Path) -> None
     for seed in (2, 0):
         settings_of(study, f"hopper-forward-known-{seed}", first_episodes=300 + seed)
     lines = best_designs(read_runs(study), PLACE, "known", RULE)[1:3].to_dict("records")
-    assert episodes_in_words([cell_of(line, Retrain(study=study)) for line in lines]) == "300 or 302"
-    assert episodes_in_words([cell_of(line, Retrain(study=study, episodes=9)) for line in lines]) == "9"
+    assert episodes_in_words(cells_of(lines, Retrain(study=study))) == "300 or 302"
+    assert episodes_in_words(cells_of(lines, Retrain(study=study, episodes=9))) == "9"
+
+
+def test_designs_of_an_arm_are_trained_together_each_with_a_body_of_its_own(study: Path) -> None:
+    for seed in range(3):
+        settings_of(study, f"hopper-forward-known-{seed}")
+    asked = Retrain(study=study, arms=("known",), most=3, together=2)
+    chosen = choose(read_runs(study), study / "chosen.csv", asked)
+    runs = ("fleet0/0", "fleet0/1", "fleet1/0")
+    assert chosen["trained"].tolist() == [f"hopper-forward-known-{run}" for run in runs]
+    two, one = cells_of(chosen.to_dict("records"), asked)
+    bodies = [float(factor) for xi in chosen["xi"] for factor in xi.split()]
+    assert (two.name, two.settings.num_runs) == ("hopper-forward-known-fleet0", 2)
+    assert [*two.settings.first_design, *one.settings.first_design] == bodies
+    settings_of(study, "hopper-forward-known-2", lr=0.002)
+    with pytest.raises(ValueError, match=r"fleet0 cannot be trained together: .* has other settings.*--together 1"):
+        cells_of(chosen.to_dict("records"), asked)
 
 
 def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:
@@ -164,6 +180,7 @@ def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path
         (["--top", "0"], "--top is 0"),
         (["--most", "0"], "--most is 0"),
         (["--episodes", "0"], "--episodes is 0"),
+        (["--together", "0"], "--together is 0"),
         (["--workers", "2", "--ray-address", "auto"], "a cluster decides itself"),
         (["--arms", "oracle"], "'oracle' is no arm of .*--arms none known"),
     ):
