@@ -35,11 +35,13 @@ from coim.experiments.run.build import build
 from coim.experiments.run.machine import available_cores, prepare
 from coim.experiments.run.settings import Settings
 
-EFFORT = Effort(repeats=5, long_repeats=2, runs=(1, 16, 64), updates=100)
+EFFORT = Effort(repeats=5, long_repeats=2, runs=(1, 16, 64, 256), fleets=(1, 16, 64), updates=100)
+SMALL = (64, 64, 64)  # hidden units of the protocol "pilot"
 TINY = Effort(
     repeats=1,
     long_repeats=1,
     runs=(1, 2),
+    fleets=(1, 2),
     batch_size=8,
     num_cells=(8,),
     model_cells=(8,),
@@ -91,11 +93,13 @@ def main(options: Options) -> None:
     device = torch.device("cpu" if options.rehearse else "cuda")
     prepare(available_cores(), device)
     effort, settings = (TINY, TINY_FLEET) if options.rehearse else (EFFORT, FLEET)
+    small = effort if options.rehearse else dataclasses.replace(effort, num_cells=SMALL)
     steps: dict[str, Callable[[], Result]] = {
         "tests": lambda: marked_tests(ends - time.monotonic()),
         "fleet": lambda: fleet(settings, device),
         **{f"update, K = {runs}": lambda runs=runs: update(effort, runs, device) for runs in effort.runs},
-        **{f"iteration, K = {runs}": lambda runs=runs: iteration(effort, runs, device) for runs in effort.runs},
+        **{f"small update, K = {runs}": lambda runs=runs: update(small, runs, device) for runs in effort.runs},
+        **{f"iteration, K = {runs}": lambda runs=runs: iteration(effort, runs, device) for runs in effort.fleets},
     }
     found: Result = {"machine": machine() | described(device), "rehearsal": options.rehearse, "parts": {}}
     options.out.parent.mkdir(parents=True, exist_ok=True)

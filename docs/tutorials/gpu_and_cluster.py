@@ -44,7 +44,7 @@ print(rows.batch_size, losses["loss_qvalue"].shape)
 #
 #     coim run walker --num-runs 10 --device cuda
 #
-# The simulations always run on the CPU. On a GPU an update is captured once as a CUDA graph and then replayed,
+# The simulations always run on the CPU. On a GPU fifty updates are captured once as a CUDA graph and then replayed,
 # because small networks would otherwise wait for Python. If the replay does not fit into the GPU's memory, add
 # ``--replay-device cpu``.
 #
@@ -61,7 +61,8 @@ print(rows.batch_size, losses["loss_qvalue"].shape)
 #     coim study paper --ray-address 10.0.0.1:6379 --cpus 2
 #     coim study paper --ray-address auto --cpus 2 --gpus 0.25
 #
-# ``--gpus 0.25`` lets four cells share a GPU. ``seeds_per_cell`` in the study's file puts several seeds into one cell,
+# ``--gpus 0.25`` lets four cells share a GPU, best through NVIDIA's MPS (``nvidia-cuda-mps-control -d``, once).
+# ``seeds_per_cell`` in the study's file puts several seeds into one cell,
 # where they are trained together. Forty runs are then four cells:
 
 from coim.experiments.study.definition import Study

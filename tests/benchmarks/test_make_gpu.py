@@ -13,7 +13,7 @@ import torch
 from benchmarks import gpu
 from benchmarks.gpu import Options, main
 
-ROWS = {"update, K = 1", "update, K = 2", "iteration, K = 1", "iteration, K = 2"}
+ROWS = {f"{row}, K = {runs}" for row in ("update", "small update", "iteration") for runs in (1, 2)}
 
 
 def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import runpy
@@ -57,12 +58,24 @@ def test_the_times_of_the_hardware_page_were_measured() -> None:
     measured = {}
     for figure in json.loads((DOCS / "results" / "benchmarks.json").read_text())["figures"]:
         measured.setdefault(figure["row"], figure["amount"]["median"])
-    table = (DOCS / "hardware.md").read_text().split("| row | median |")[1]
+    table, on_gpu = (DOCS / "hardware.md").read_text().split("| row | median |")[1].split("## On a GPU")
     told = re.findall(r"^\| (.*) \| ([\d.,]+) [\w/ ]+ \|$", table, re.MULTILINE)
     assert len(told) == 17
     assert {row: float(amount.replace(",", "")) for row, amount in told} == {
         row: pytest.approx(measured[row], rel=5e-3) for row, _ in told
     }
+    with (DOCS / "results" / "gpu.csv").open() as file:
+        rows = {(row["runs"], row["units"], row["products"]): float(row["update_ms"]) for row in csv.DictReader(file)}
+    told = re.findall(
+        r"^\| (\d+), 3 x (\d+)(?:, .*?(TF32|bfloat16)`?)? \| ([\d.]+) ms \|.* \| ([\d.]+) ms \|$", on_gpu, re.MULTILINE
+    )
+    assert len(told) == 8
+    for runs, units, products, update, each in told:
+        found = rows[runs, units, products.lower() or "float32"]
+        assert (float(update), float(each)) == (
+            pytest.approx(found, abs=5e-3),
+            pytest.approx(found / int(runs), rel=0.03),
+        )
 
 
 def write_site(folder: Path, **pages: str) -> Path:
