@@ -1,4 +1,4 @@
-"""A window that shows a body while it moves: MuJoCo's own viewer, which the mouse turns and zooms."""
+"""A body that is shown while it moves: in a window, MuJoCo's own viewer that the mouse turns and zooms, or elsewhere."""
 
 from __future__ import annotations
 
@@ -11,6 +11,35 @@ from coim.envs.camera import PERIOD, SCREENS, dress, has_screen
 from coim.envs.root import Root
 
 PICTURE = 480  # pixels along a side of the off-screen buffer, which a window does not use
+
+
+class Figure:
+    """A body to be shown, in the pose that it is given.
+
+    Args:
+        spec: the body; it is not changed.
+        root: how the body moves.
+
+    Attributes:
+        model: the body with sky and floor.
+        data: its pose.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, *, root: Root) -> None:
+        self._travelled = root.unseen
+        self.model = dress(spec, PICTURE, PICTURE).compile()
+        self.data = mujoco.MjData(self.model)
+
+    def pose(self, qpos: np.ndarray) -> None:
+        """Take a pose.
+
+        Args:
+            qpos: joint positions, ``[nq]``; the first ones are the place on the ground in m.
+        """
+        self.data.qpos[:] = qpos
+        for axis in range(self._travelled):  # as in `Camera.photograph`
+            self.data.qpos[axis] = qpos[axis] % PERIOD
+        mujoco.mj_forward(self.model, self.data)
 
 
 class Window:
@@ -30,11 +59,11 @@ class Window:
         from mujoco import viewer  # opens the window system, which a machine without a display does not have
 
         self._travelled, self._step_seconds, self._due = root.unseen, step_seconds, time.monotonic()
-        self._model = dress(spec, PICTURE, PICTURE).compile()
-        self._data = mujoco.MjData(self._model)
-        self._handle = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        self._figure = Figure(spec, root=root)
+        model, data = self._figure.model, self._figure.data
+        self._handle = viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
         with self._handle.lock():
-            mujoco.mjv_defaultFreeCamera(self._model, self._handle.cam)
+            mujoco.mjv_defaultFreeCamera(model, self._handle.cam)
             self._handle.cam.azimuth, self._handle.cam.elevation = 90.0, -8.0 if root.kind == "planar" else -25.0
 
     def show(self, qpos: np.ndarray) -> None:
@@ -46,10 +75,8 @@ class Window:
         if not self._handle.is_running():
             return
         with self._handle.lock():
-            self._data.qpos[:] = qpos
-            for axis in range(self._travelled):  # as in `Camera.photograph`
-                self._data.qpos[axis] = self._handle.cam.lookat[axis] = qpos[axis] % PERIOD
-            mujoco.mj_forward(self._model, self._data)
+            self._figure.pose(qpos)
+            self._handle.cam.lookat[: self._travelled] = self._figure.data.qpos[: self._travelled]
         self._handle.sync()
         self._due = max(self._due + self._step_seconds, time.monotonic())
         time.sleep(max(0.0, self._due - time.monotonic()))

@@ -3,7 +3,7 @@
 No screen is needed. Each film shows the evaluation to which the design owes its best return, at the speed at which it
 happened, and lies in ``videos/`` of the run's folder or where ``--out`` says. A run that is still going on can be
 watched too, and so can a policy that ``coim export`` has written. ``coim watch --pretrained hopper`` films a robot that
-comes with the package.
+comes with the package. ``--live`` shows the robot in a browser instead, where it walks until Ctrl-C.
 """
 
 from __future__ import annotations
@@ -51,6 +51,10 @@ class Watch:
     """Likewise."""
     format: Literal["mp4", "webp"] = "mp4"
     """webp: an animated picture, which a README shows."""
+    live: bool = False
+    """Show the robot in a browser, by mjviser, in place of a film (pip install 'coim[live]')."""
+    port: int = 8080
+    """Port of --live on this machine; the next free one if it is taken."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -59,6 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with on_command_line(own_process=arguments is None, also=(ImportError, RuntimeError)):
         source = source_of(asked)
         print(f"reading {source}", file=sys.stderr, flush=True)  # imports take seconds
+        if asked.live:
+            show(asked, source)
+            return
         draw_without_screen()
         from coim.experiments.drawing.film import film, film_policy
 
@@ -71,6 +78,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise ValueError(f"{source} is one policy: leave out --run and --policy, which choose one of a run")
         seconds = PRETRAINED_SECONDS if asked.pretrained else None
         print(film_policy(source, seconds=seconds, out=asked.out or Path(), **how), flush=True)
+
+
+def show(asked: Watch, source: Path) -> None:
+    """Let the robot walk in a browser.
+
+    Raises:
+        ValueError: if something of a film is asked for.
+    """
+    from coim.experiments.drawing.live import live
+
+    film = ("steps", "out", "width", "height", "format")
+    if given := [f"--{name}" for name in film if getattr(asked, name) != getattr(Watch, name)]:
+        raise ValueError(f"{', '.join(given)} is of a film: leave it out with --live")
+    live(source, design=asked.design, run=asked.run, policy=asked.policy, body=asked.body, port=asked.port)
 
 
 def source_of(asked: Watch) -> Path:
