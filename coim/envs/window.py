@@ -1,4 +1,4 @@
-"""A body that is shown while it moves: in a window, MuJoCo's own viewer that the mouse turns and zooms, or in a page."""
+"""A body that is shown while it moves: in MuJoCo's own window, which the mouse turns and zooms, or on a page."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def draw_panel(
         if label == "mean":  # the single runs are the same in both panels
             rows += [row for run in own for row in rows_of(run)]
     if axes.lines:
-        axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design,\n{label} (1)")
+        axes.set(title=f"{environment}, {task}", ylabel=f"best return of a design,\n{label}")
         axes.spines[["top", "right"]].set_visible(False)
         axes.locator_params(axis="x", integer=True)
     return bool(axes.lines)

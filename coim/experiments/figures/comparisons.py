@@ -23,7 +23,7 @@ from coim.experiments.statistics.retrained import with_retrained
 from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
-LABELS = {"area": "area: mean best return\nof a design (1)", "final": "final: highest\nbest return (1)"}
+LABELS = {"area": "area: mean best return\nof a design", "final": "final: highest\nbest return"}
 ENTROPY = "Q also holds the entropy bonus of Eq. 3, the return does not."
 PREDICTION = "The prediction is the return that a posterior expected where one chose the bodies, and Eq. 5 elsewhere."
 OF_SEARCH = ("search_gain", "rank_correlation", "rank_correlation_raw", "coverage", "bias_optimised", "bias_random")
@@ -163,7 +163,7 @@ def pairs(runs: Runs, measured: pd.DataFrame) -> Plot:
             axes.plot([row["improvement_low"], row["improvement_high"]], [y, y], linewidth=2, color=arm.colour)
             axes.plot(row["improvement"], y, **arm.point)
         axes.axvline(0.5, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-        axes.set(xlim=(-0.03, 1.03), ylim=(-0.7, len(labels) - 0.3), xlabel="probability of improvement (1)")
+        axes.set(xlim=(-0.03, 1.03), ylim=(-0.7, len(labels) - 0.3), xlabel="probability of improvement")
         axes.set(title=name, yticks=range(len(labels)), yticklabels=labels if name == there[0] else [])
         axes.tick_params(axis="y", labelsize=7)
     caption = (
@@ -223,7 +223,7 @@ def predicted(runs: Runs) -> Plot:
             axes.scatter(x, y, s=12, alpha=0.6, linewidth=0, **arm_named(arm).point)
             rows += own
         axes.axline((0, 0), slope=1, color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-        axes.set(xlabel="prediction, reward per step (1)", ylabel="best return / steps (1)")
+        axes.set(xlabel="prediction, reward per step", ylabel="best return / steps")
         axes.set(title=", ".join(place))
     for axes in grid[len(places) :]:
         axes.remove()

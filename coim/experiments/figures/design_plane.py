@@ -61,9 +61,9 @@ def drawn(rows: pd.DataFrame) -> Figure:
         for axes, (source, title) in zip(line, SOURCES.items()):
             mesh = draw(axes, own, source)
             axes.set_title(title if state == states[0] else "", fontsize=10)
-        line[0].set(ylabel=f"state {state}\ncomp. 2 (1)")
+        line[0].set(ylabel=f"state {state}\ncomp. 2")
     for axes in line:
-        axes.set(xlabel="component 1 (1)")
+        axes.set(xlabel="component 1")
     bar = figure.colorbar(mesh, ax=grid, extend="both", shrink=0.8)
     bar.set_label("squared change of the next state\n(variances of one-step changes, 1)")
     put_legend(figure, handles())

@@ -51,7 +51,7 @@ PROBES = {
 }
 MODELS = {"delta": "learns the change", "next": "learns the next observation"}
 UNITS = {
-    "share": "share of the change\nthat is not explained (1)",
+    "share": "share of the change\nthat is not explained",
     "mse": "squared error, raw\n(m, rad, m/s, rad/s, squared)",
 }
 MOST = 3.0  # share up to which panels reach: first models err by hundreds, and would press the rest flat

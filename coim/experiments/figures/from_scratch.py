@@ -126,7 +126,7 @@ def draw_designs(rows: pd.DataFrame, notes: Sequence[str]) -> Plot:
     panels = figure.subplots(1, len(places), squeeze=False, width_ratios=widths)[0]
     for axes, (place, own) in zip(panels, places.items()):
         draw_boxes(axes, {arm: rows["best_return"].to_numpy() for arm, rows in own.items()})
-        axes.set(title=", ".join(place), ylabel="best return, retrained from scratch (1)")
+        axes.set(title=", ".join(place), ylabel="best return, retrained from scratch")
     caption = (
         "Highest return on the best designs of each run, after training plain SAC on each of them from scratch. "
         "Points: designs. Boxes: quartiles and median. Whiskers: all designs."
@@ -159,7 +159,7 @@ def draw_tests(table: pd.DataFrame) -> Plot:
     for axes, (place, rows) in zip(grid, own.items()):
         draw_differences(axes, rows)
         axes.set(title=", ".join(place))
-    grid[-1].set(xlabel="difference of the mean best return, retrained from scratch (1)")
+    grid[-1].set(xlabel="difference of the mean best return, retrained from scratch")
     caption = (
         "Fig. 2 in numbers: difference of the mean best returns of two arms over their retrained designs. Bars: 95 % "
         "bootstrap intervals over runs. Dashed: no difference."

@@ -23,12 +23,12 @@ from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
 LABELS = {
-    "search_gain": "search_gain: searched\nminus random bodies (1)",
-    "area": "area: mean best return\nof a design (1)",
-    "final": "final: highest\nbest return (1)",
-    "rank_correlation": "rank_correlation of\npredicted and achieved (1)",
-    "coverage": f"coverage of {LEVEL:.0%}\nintervals (1)",
-    "retrained": "retrained: best body,\nfrom scratch (1)",
+    "search_gain": "search_gain: searched\nminus random bodies",
+    "area": "area: mean best return\nof a design",
+    "final": "final: highest\nbest return",
+    "rank_correlation": "rank_correlation of\npredicted and achieved",
+    "coverage": f"coverage of {LEVEL:.0%}\nintervals",
+    "retrained": "retrained: best body,\nfrom scratch",
 }
 MARKS = {"search_gain": 0.0, "rank_correlation": 0.0, "coverage": LEVEL}  # dashed lines
 IN_A_LINE = 3

@@ -8,12 +8,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from coim.envs import MorphEnv
+from coim.episode import run_episode
 from coim.experiments.drawing.layout import STEPS, new_figure
 from coim.experiments.drawing.palette import BLACK, BLUE, GREY, SKY, style_of
-from coim.experiments.frames import curves
+from coim.experiments.frames import curves, designs_of
 from coim.experiments.report.axes import (
     cross_handles,
     episodes_in_a_point,
@@ -27,18 +30,24 @@ from coim.experiments.report.axes import (
 from coim.experiments.report.page import Section
 from coim.experiments.run.records import Record, number
 
+RANDOM_EPISODES = 4
 LOSSES = {  # column of metrics.csv behind the learner's name, and the words beside its axis
     "loss_actor": "actor loss",
-    "loss_qvalue": "critic loss (1, squared)",
+    "loss_qvalue": "critic loss",
     "alpha_entropy": r"$\alpha\,\times$ entropy (nats)",
     "loss_dynamics": "model loss, Eq. 6",
 }
 
 
-def learning_curves(records: Sequence[Record]) -> Section:
-    """Return over training steps."""
+def learning_curves(records: Sequence[Record], body: type[MorphEnv] | None) -> Section:
+    """Return over training steps, and that of random actions."""
     figure, (axes,) = new_figure(3.4)
     caption = "Return of the deterministic policy after each training episode."
+    by_chance, lines = "", []
+    if body is not None:
+        level = random_return(records[0], body)
+        lines = [axes.axhline(level, color=GREY, linestyle=":", label="random actions on the first body")]
+        by_chance = f" Random actions on the first body: {number(level)}."
     if len(records) == 1:
         mark_builds(axes, records[0])
         sampled = curves(records[0].episodes, "env_steps", "training_return").averaged(episodes_in_a_point(records[0]))
@@ -49,7 +58,7 @@ def learning_curves(records: Sequence[Record]) -> Section:
         caption += " Upright lines: the next body. Faint lines: single runs, where there are several."
     else:
         plot_over_steps(axes, records, "return")
-        explain(figure, records, more=cross_handles(records))
+        explain(figure, records, more=[*lines, *cross_handles(records)])
     for record in records:
         mark_divergences(axes, record.diverged, "env_steps", "return")
     axes.set(xlabel=STEPS, ylabel="return of an episode")
@@ -58,9 +67,19 @@ def learning_curves(records: Sequence[Record]) -> Section:
         title="Learning curves",
         figure=figure,
         caption=caption,
-        alt="Return over training steps. Last mean: " + "; ".join(last),
+        alt="Return over training steps. Last mean: " + "; ".join(last) + f".{by_chance}",
         notes=points_in_words(records),
     )
+
+
+def random_return(record: Record, body: type[MorphEnv]) -> float:
+    """Mean return of uniform actions on the first body of a run, over a few episodes of its length."""
+    first = designs_of(record.designs.sort_values(["run", "design"])[:1])
+    settings = {name: record.settings[name] for name in ("task", "episode_steps") if name in record.settings}
+    bodies = body(num_runs=RANDOM_EPISODES, seed=0, **settings)
+    design = torch.tensor(first, dtype=torch.float32).expand(RANDOM_EPISODES, -1)
+    rows = run_episode(bodies, None, design=design, rng=torch.Generator().manual_seed(0))
+    return float(rows["next", "reward"].sum(0).mean())
 
 
 def model_errors(records: Sequence[Record]) -> Section:

@@ -70,7 +70,7 @@ def sections_of(records: Sequence[Record], body: type[MorphEnv] | None) -> list[
     sections = [
         best_bodies(records[0]) if len(records) == 1 else comparison(records),
         designs.best_returns(records),
-        learning.learning_curves(records),
+        learning.learning_curves(records, body),
         designs.designs_over_time(records, body),
         designs.bodies(records, body),
         designs.predictions(records),

@@ -13,15 +13,16 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from matplotlib.image import imread
 from tiny_runs import run_by_options
 
-from coim import HalfCheetahMorph, HopperMorph
+from coim import HalfCheetahMorph, HopperMorph, run_episode
 from coim.experiments.commands.report import main
 from coim.experiments.frames import designs_of
 from coim.experiments.report.designs import describe_correlation
 from coim.experiments.report.run_report import write_report
-from coim.experiments.run.records import read_record, read_records
+from coim.experiments.run.records import number, read_record, read_records
 from tests.experiments.report.made_up_run import write_run
 
 VOID = {"meta", "img", "br"}
@@ -135,6 +136,11 @@ def test_the_end_of_a_run_writes_a_page_with_every_picture_beside_the_old_one(ru
     assert config["revision"] is None or config["revision"] in page.words
     assert "all 7 designs are done" in page.words
     assert "(n = 6 designs)" in page.words  # the first is built without a prediction
+    (curves,) = [image["alt"] for image in page.images if image["alt"].startswith("Return over training steps")]
+    bodies = HopperMorph(num_runs=4, episode_steps=config["settings"]["episode_steps"], seed=0)
+    design = torch.tensor(HopperMorph.FIRST_DESIGNS[0]).expand(4, -1)
+    by_chance = run_episode(bodies, None, design=design, rng=torch.Generator().manual_seed(0))["next", "reward"].sum(0)
+    assert curves.endswith(f"Random actions on the first body: {number(float(by_chance.mean()))}.")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -286,7 +292,9 @@ def test_bodies_that_are_not_ours_are_not_drawn(runs: Path, tmp_path: Path) -> N
     folder = shutil.copytree(runs / "one", tmp_path / "run")
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"environment": "giraffe"}))
-    assert "giraffe is no environment of coim" in check(write_report([folder])).words
+    page = check(write_report([folder]))
+    assert "giraffe is no environment of coim" in page.words
+    assert not any("Random actions" in image["alt"] for image in page.images)
     assert len(check(write_report([folder], body=HopperMorph)).images) == len(PICTURES)
 
 
