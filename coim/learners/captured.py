@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -78,7 +79,8 @@ class Graph:
         """Call on another stream, as `torch.cuda.CUDAGraph` asks for: libraries make their workspaces then."""
         here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(here)
-        with torch.cuda.stream(aside):
+        with torch.cuda.stream(aside), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*without CUDA graph capture")  # Adam's; the next call captures
             output = self._function(*inputs)
         here.wait_stream(aside)
         self._warm = True
