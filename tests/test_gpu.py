@@ -50,13 +50,15 @@ def saved(algorithm: CoAdaptation) -> Mapping[str, Any]:
 def test_an_update_by_a_captured_graph_is_the_eager_one(
     make: Callable[[], Any], make_rows: Rows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    batches = make_rows(20, 32, 3).cuda()
+    batches = make_rows(70, 32, 3).cuda()  # a graph of fifty updates, and one of twenty
     captured = make()
     with monkeypatch.context() as patched:
         patched.setattr("coim.learners.captured.captures", lambda device: False)
         eager = make()
-        eager.update(batches)
-    captured.update(batches)
+        for _ in range(3):
+            eager.update(batches)
+    for _ in range(3):  # called, captured, replayed
+        captured.update(batches)
     for one, other in zip(captured.weights_by_run(), eager.weights_by_run(), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-7)
 

@@ -297,12 +297,12 @@ def test_a_learner_can_go_on_from_one_that_has_learnt_nothing(make_rows: Rows) -
 @pytest.mark.gpu
 @pytest.mark.parametrize("num_runs", [None, 3])
 def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> None:
-    """Twenty updates, of which all but the first few replay a captured graph, and twenty more after a fresh start."""
+    """Twenty updates that are called, twenty captured and twenty replayed, each after a fresh start."""
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     learners = [sac_learner(num_runs, device=device, lr=LR) for device in ("cpu", "cuda")]
     on_cpu, on_gpu = learners
-    for seed in (0, 1):
+    for seed in (0, 1, 2):
         batches = make_rows(20, 32, *([num_runs] if num_runs else []), seed=seed)
         noise = [torch.randn_like(batches["action"]) for _ in range(2)]
         give_noise(on_cpu, noise)
