@@ -39,17 +39,15 @@ from coim.tables import Layout
 Spoilt = Literal["nothing", "weights drawn anew", "off by one deviation"]
 NONE = "no imagination"
 # Half of the batches of both learners is imagined, as random bodies: the paper's fifth in the population's batches
-# alone reaches the controller of a body only through the weights that it starts from.
+# alone reaches the controller of a body only through the weights that it starts from. Networks, updates and episodes are
+# those of the protocol "pilot", in which the two bodies earn 630 and 1,000 on the mean without imagination.
 SIZES = Settings(
     num_runs=5,
     num_designs=2,
-    first_episodes=8,
-    individual_updates=250,
-    population_updates=100,
-    model_updates=50,
-    batch_size=128,
-    num_cells=(64, 64),
-    model_cells=(64, 64),
+    first_episodes=6,
+    num_cells=(64, 64, 64),
+    model_cells=(200, 200, 200),
+    compile=True,
     imagine="random",
     imagined_share=0.5,
     individual_imagined_share=0.5,
@@ -227,7 +225,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         band = {"low": low, "high": high} if name == NONE and len(found) > 1 else {}
         style = {"color": arm.colour, "linestyle": arm.dashes, "linewidth": 2.6 if "governed" in name else 1.4}
         draw_mean(axes, found.columns.to_numpy(), value, **band, **style, label=name)
-    axes.set(xlabel="training steps of one run (1)", ylabel="deterministic return (1), mean over runs")
+    axes.set(xlabel="training steps of one run", ylabel="deterministic return, mean over runs")
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     save(figure, path)

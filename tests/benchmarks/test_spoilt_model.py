@@ -25,6 +25,7 @@ TINY = dataclasses.replace(
     batch_size=10,
     num_cells=(8,),
     model_cells=(8,),
+    compile=False,
 )
 
 

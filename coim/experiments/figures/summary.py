@@ -101,7 +101,8 @@ def draw_measure(axes: Axes, place: Place, name: str, over: pd.DataFrame, rows: 
         axes.hlines(rows["mean"][arm], x - 0.3, x + 0.3, color=look.colour, linewidth=2.5)
     if name in MARKS:
         axes.axhline(MARKS[name], color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-    axes.set_xticks(range(len(rows)), list(rows.index), fontsize=7, rotation=90 * (len(rows) > FLAT))
+    names = [arm if len(rows) > FLAT else arm.replace("-", "-\n") for arm in rows.index]
+    axes.set_xticks(range(len(rows)), names, fontsize=7, rotation=90 * (len(rows) > FLAT))
     axes.set(ylabel=LABELS[name], title=", ".join(place), xlim=(-0.6, len(rows) - 0.4))
 
 
