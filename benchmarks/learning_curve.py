@@ -117,7 +117,7 @@ def summarise(curve: Curve, rows: pd.DataFrame) -> None:
         table.append([arm, count, *(f"{number:.4g}" for number in numbers)])
     axes.axhline(random_return, color="black", linestyle=":", label="random policy")
     axes.axhline(5 * random_return, color="black", linestyle="--", linewidth=0.8, label="5 x random policy")
-    axes.set(xlabel="training episodes (1000 steps each)", ylabel="deterministic return (1)")
+    axes.set(xlabel="training episodes (1000 steps each)", ylabel="deterministic return")
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     save(figure, curve.out / "curves.png")

@@ -39,8 +39,8 @@ from coim.tables import Layout
 Spoilt = Literal["nothing", "weights drawn anew", "off by one deviation"]
 NONE = "no imagination"
 # Half of the batches of both learners is imagined, as random bodies: the paper's fifth in the population's batches
-# alone reaches the controller of a body only through the weights that it starts from. Networks, updates and episodes are
-# those of the protocol "pilot", in which the two bodies earn 630 and 1,000 on the mean without imagination.
+# alone reaches the controller of a body only through the weights that it starts from. Networks, updates and episodes
+# are those of the protocol "pilot", in which the two bodies earn 630 and 1,000 on the mean without imagination.
 SIZES = Settings(
     num_runs=5,
     num_designs=2,
