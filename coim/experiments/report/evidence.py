@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -58,6 +59,7 @@ def worth(records: Sequence[Record]) -> Section:
     rows: list[list[str]] = []
     found: list[tuple[str, Estimate]] = []
     notes: list[str] = []
+    alike: dict[str, list[list[float]]] = {}
     for record in records:
         prefix = f"{record.name}, " if len(records) > 1 else ""
         gains: list[Estimate] = []
@@ -68,10 +70,16 @@ def worth(records: Sequence[Record]) -> Section:
         if len(gains) > 1:
             found.append((f"{prefix}mean of {len(gains)} runs", mean_of_runs([gain.value for gain in gains])))
             rows.append([found[-1][0], "", "", "", "", *_cells(found[-1][1])])
+        alike.setdefault(_less_seed(record), []).append([gain.value for gain in gains])
         width = _width(record, gains)
         notes.append(f"{record.name}: {width}" if prefix else width)
     if not found:
         return Section(title=title, notes=notes)
+    for folders in alike.values():
+        if len(folders) > 1 and (values := [value for own in folders for value in own]):
+            name = f"mean of {len(values)} runs in {len(folders)} folders that differ in their seed alone"
+            found.append((name, mean_of_runs(values)))
+            rows.append([name, "", "", "", "", *_cells(found[-1][1])])
     notes.append(
         "An interval of one run is over its bodies: it says what others, chosen by the same run, could have given. "
         "What another seed would give only several runs can tell."
@@ -90,6 +98,13 @@ def worth(records: Sequence[Record]) -> Section:
         notes=notes,
         tables=[*narrow(Table(head=head, rows=rows))],
     )
+
+
+def _less_seed(record: Record) -> str:
+    """The settings of a run, less its seed and what computes nothing."""
+    left_out = {"seed", "out", "resume", "name", "quiet", "threads", "checkpoint_every", "log", "wandb"}
+    left_out |= {"num_runs", "device"}
+    return json.dumps({name: value for name, value in record.settings.items() if name not in left_out}, sort_keys=True)
 
 
 def _drawn(found: Sequence[tuple[str, Estimate]]) -> Figure:

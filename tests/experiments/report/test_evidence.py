@@ -70,6 +70,14 @@ def test_the_search_is_worth_optimised_minus_random_bodies(tmp_path: Path) -> No
     assert "only several runs can tell" in section.notes[-1]
 
 
+def test_folders_that_differ_in_their_seed_alone_have_a_mean_over_all_their_runs(tmp_path: Path) -> None:
+    folders = [write_run(tmp_path / str(seed), (*RETURNS, last), seed=seed) for seed, last in enumerate((250.0, 450.0))]
+    other = write_run(tmp_path / "other", (*RETURNS, 250.0), seed=0, chosen_by="returns")
+    rows = shown(worth(read_records([*folders, other]))).tables[0].rows
+    assert [row[0] for row in rows][3:] == ["mean of 2 runs in 2 folders that differ in their seed alone"]
+    assert rows[-1][-2:] == ["150", "-485.3 to 785.3"]  # of 200 and 100: 150 -+ 12.7 x 50
+
+
 def test_without_a_search_there_is_nothing_to_compare(tmp_path: Path) -> None:
     found = {
         "bodies were not searched": write_run(tmp_path / "random", RETURNS, bodies="random"),
