@@ -72,6 +72,9 @@ for cell in study.cells():
     print(cell.name, cell.settings.num_runs)
 
 # %%
+# ``coim retrain FOLDER --together 10 --gpus 1`` trains the designs of an arm likewise, ten of them in one process, each
+# run with a body of its own.
+#
 # A cell whose process or node dies is taken up from its last checkpoint. ``ledger.csv`` in the study's folder says
 # how far each cell is, and the same command goes on with what is left. Under a batch system such as Slurm, a run that
 # is stopped by ``SIGTERM`` goes on by ``coim resume FOLDER``, with the same numbers as if it had not been stopped.

@@ -11,7 +11,7 @@ import pytest
 from interrupted_runs import cut
 from tiny_runs import TINY, resume
 
-from coim import EpisodeDone
+from coim import EpisodeDone, HopperMorph
 from coim.envs import BODIES
 from coim.experiments.commands.study import main as entry
 from coim.experiments.run.build import build
@@ -130,6 +130,12 @@ def test_a_first_design_is_held_against_each_body() -> None:
         study(overrides={"first_design": (1, 1, 1, 2.5)})
     with pytest.raises(ValueError, match="a design of walker has 7 scale factors"):
         study(environments=("hopper", "walker"), overrides={"first_design": (1, 1, 1, 2)})
+    together = {"seeds": (0, 1), "seeds_per_cell": 2}
+    two = study(**together, overrides={"first_design": (1, 1, 1, 2, 0.6, 1, 1, 1)})
+    algorithm = build(HopperMorph, two.cells()[0].settings)
+    assert algorithm.design_choice.first_designs.tolist() == [[[1, 1, 1, 2], [pytest.approx(0.6), 1, 1, 1]]]
+    with pytest.raises(ValueError, match="first_design is .* from 0.5 to 2"):
+        study(**together, overrides={"first_design": (1, 1, 1, 2, 2.5, 1, 1, 1)})
 
 
 def test_the_preview_has_the_papers_networks_batches_and_updates() -> None:
