@@ -134,7 +134,7 @@ def test_a_first_design_is_held_against_each_body() -> None:
     two = study(**together, overrides={"first_design": (1, 1, 1, 2, 0.6, 1, 1, 1)})
     algorithm = build(HopperMorph, two.cells()[0].settings)
     assert algorithm.design_choice.first_designs.tolist() == [[[1, 1, 1, 2], [pytest.approx(0.6), 1, 1, 1]]]
-    with pytest.raises(ValueError, match="first_design is .* from 0.5 to 2"):
+    with pytest.raises(ValueError, match=r"first_design is .* from 0\.5 to 2"):
         study(**together, overrides={"first_design": (1, 1, 1, 2, 2.5, 1, 1, 1)})
 
 
