@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from coim.experiments.frames import at, spearman
-from coim.experiments.predictions import coverage
+from coim.experiments.predictions import coverage, worth_of_search
 from coim.experiments.statistics.intervals import Statistic, holm, improvement, interval, mean
 from coim.experiments.statistics.predicted import bias, later_predictions, spearman_given
 from coim.experiments.study.arms import pairs_of_arms
@@ -116,7 +116,7 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         "planned": run.num_designs,
         "area": float(values.mean()),
         "final": float(values.max()),
-        "search_gain": best_mean(run, "optimised") - best_mean(run, "random") if run.over else math.nan,
+        "search_gain": worth_of_search(run.designs).value if run.over else math.nan,
         "rank_correlation": spearman_given(chosen["predicted"], chosen["best_return"], given=chosen["design"]),
         "rank_correlation_raw": spearman(chosen["predicted"], chosen["best_return"]),
         "coverage": coverage(chosen).share,
@@ -126,12 +126,6 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         "episode_seconds": float(np.median(own.get("seconds/episode", math.nan))),
         "updates": len(own) * an_episode,
     }
-
-
-def best_mean(run: Run, kind: str) -> float:
-    """Mean best return of a run's designs of one kind; NaN where there is none."""
-    values = run.designs["best_return"][run.designs["kind"] == kind]
-    return float(np.mean(values.to_numpy())) if len(values) else math.nan
 
 
 def comparisons(runs: Runs, measured: pd.DataFrame) -> pd.DataFrame:
