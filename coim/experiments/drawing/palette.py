@@ -28,6 +28,7 @@ DASHES: tuple[Dashes, ...] = (
     (0, (8, 2)),
     (0, (6, 1, 1, 1)),
     (0, (2, 3)),
+    (0, (10, 3, 2, 3)),
 )
 CHARACTERS = 120  # that fit side by side in a legend over the page's width
 # The circle of Fig. 4.

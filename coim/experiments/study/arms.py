@@ -289,6 +289,21 @@ ARMS = by_name(
         colour=BLUE,
         marker="*",
     ),
+    Arm(
+        name="grounded-governed-both",
+        words="as grounded-governed, in the batches of the individual networks too",
+        settings={
+            "imagine": "random",
+            **ANCHORED,
+            "governed": True,
+            "individual_imagined_share": 0.2,
+            **METHODS["grounded"],
+        },
+        baselines=("grounded", "grounded-governed"),
+        family="grounded",
+        colour=GREY,
+        marker="o",
+    ),
 )
 
 

@@ -31,11 +31,12 @@ def bodies_in_fleets() -> Study:
 
 def imagining(name: str, seeds: tuple[int, ...]) -> Study:
     """What to imagine where bodies are chosen as `grounded` does; on the Half-Cheetah fewer arms, to save hours."""
-    kept = ("grounded", "grounded-known", "grounded-random-anchored", "grounded-governed")
+    kept = ("grounded", "grounded-governed-both", "grounded-governed")
+    others = ("known", "random-anchored", "noisy", "random", "noisy-anchored")
     return Study(
         name=name,
         environments=("hopper",),
-        arms=(*kept, "grounded-noisy", "grounded-random", "grounded-noisy-anchored"),
+        arms=(*kept, *(f"grounded-{other}" for other in others)),
         seeds=seeds,
         protocol="pilot",
         blocks=(Block(environments=("half_cheetah",), arms=kept, seeds=seeds),),

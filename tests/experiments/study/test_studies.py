@@ -156,7 +156,7 @@ def test_a_method_is_confirmed_by_the_study_it_was_developed_on_with_other_seeds
         assert own[0] == own[1]
         assert not {*develop.seeds} & {*confirm.seeds}
     counts = [len(STUDIES[name].cells()) for name in ("bodies-develop", "bodies", "imagining-develop", "imagining")]
-    assert counts == [7 * 5, 7 * 10, (7 + 4) * 5, (7 + 4) * 10]
+    assert counts == [7 * 5, 7 * 10, (8 + 3) * 5, (8 + 3) * 10]
 
 
 def test_an_arm_that_imagines_with_grounded_bodies_differs_from_its_namesake_in_the_choice_alone() -> None:
