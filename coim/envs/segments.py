@@ -18,8 +18,8 @@ from math import isnan, pi
 import mujoco
 import numpy as np
 
-from coim.envs.root import CAPSULE, FREE, HINGE, find_height
-from coim.envs.simulation import lowest_point
+from coim.envs.root import CAPSULE, HINGE, find_height
+from coim.envs.simulation import start_clearance
 
 Scale = Mapping[str, Sequence[str]]
 SAME_MASS = 1e-9  # largest relative error of a body's mass after its densities were made constant
@@ -60,7 +60,7 @@ class Segments:
         self._entries = _entries_of_geoms(drawn, scale)
         model = drawn.compile()
         self._bodies = list(self._plan(drawn, model, scale))
-        self._clearance = _start_clearance(model)
+        self._clearance = None if find_height(model) is None else start_clearance(model)
 
     def stretch(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
         """Scale the lengths of a copy of the drawn robot in place; its root stays where it is.
@@ -94,7 +94,7 @@ class Segments:
         self.stretch(spec, design)
         if self._clearance is None:
             return
-        rise = self._clearance - (_start_clearance(spec.compile()) or 0.0)
+        rise = self._clearance - start_clearance(spec.compile())
         root = next(body for body in spec.bodies if body.parent is not None and body.parent.name == "world")
         root.pos = root.pos + np.array([0.0, 0.0, rise])
         for joint in root.joints:  # a height that is counted from the floor goes on being so
@@ -200,15 +200,3 @@ def _turned(model: mujoco.MjModel, body: int) -> np.ndarray:
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, model.body_quat[body])
     return matrix.reshape(3, 3)
-
-
-def _start_clearance(model: mujoco.MjModel) -> float | None:
-    """Return the height of the lowest point in the start pose with all joints within their ranges; None if fixed."""
-    if find_height(model) is None:
-        return None
-    data = mujoco.MjData(model)
-    for joint in np.flatnonzero((model.jnt_limited == 1) & (model.jnt_type != FREE)):
-        at = model.jnt_qposadr[joint]
-        data.qpos[at] = np.clip(data.qpos[at], *model.jnt_range[joint])
-    mujoco.mj_kinematics(model, data)
-    return lowest_point(model, data)

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from coim.envs.root import BOX, CAPSULE, CYLINDER, ELLIPSOID, SPHERE, colliding, find_height
+from coim.envs.root import BOX, CAPSULE, CYLINDER, ELLIPSOID, FREE, SPHERE, colliding, find_height
 
 BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: far beyond any working body; MuJoCo itself warns only from 1e10 on
 
@@ -183,3 +183,16 @@ def lowest_point(model: mujoco.MjModel, data: mujoco.MjData) -> float:
         default=np.nan,
     )
     return float(lowest.min())
+
+
+def start_clearance(model: mujoco.MjModel) -> float:
+    """Return the height in m of a robot's lowest point above z = 0 in its start pose, all joints within their ranges.
+
+    A start pose may be beyond them, as the ant's, whose legs are stretched out; the first steps drive it back.
+    """
+    data = mujoco.MjData(model)
+    for joint in np.flatnonzero((model.jnt_limited == 1) & (model.jnt_type != FREE)):
+        at = model.jnt_qposadr[joint]
+        data.qpos[at] = np.clip(data.qpos[at], *model.jnt_range[joint])
+    mujoco.mj_kinematics(model, data)
+    return lowest_point(model, data)

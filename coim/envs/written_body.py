@@ -15,7 +15,7 @@ import numpy as np
 
 from coim.envs.fleet import Fleet
 from coim.envs.root import FLOOR, find_height
-from coim.envs.simulation import lowest_point
+from coim.envs.simulation import start_clearance
 
 EXACT = 1e-9  # m; a larger error is none of rounding
 CHECKED = 8  # random designs, and corners of the bounds, on which the text is checked
@@ -36,8 +36,8 @@ class WrittenBody:
     Attributes:
         texts: text before, between and behind the slots, ``n + 1``.
         slots: constant, slopes and share of the start of each slot, ``[n, D + 2]``, in the units of the file.
-        clearance: constant and slopes of the lowest point's height in the start pose in m, ``[D + 1]``; None if no
-            slot has a share of the start.
+        clearance: constant and slopes of the lowest point's height in the start pose with all joints within their
+            ranges, in m, ``[D + 1]``; None if no slot has a share of the start.
     """
 
     texts: tuple[str, ...]
@@ -49,7 +49,7 @@ class WrittenBody:
         start = 0.0
         if self.clearance is not None:
             flat = mujoco.MjModel.from_xml_string(self._filled(design, start))
-            start = float(self.clearance @ np.concatenate([[1.0], design])) - _lowest(flat)
+            start = float(self.clearance @ np.concatenate([[1.0], design])) - start_clearance(flat)
         return self._filled(design, start)
 
     def _filled(self, design: np.ndarray, start: float) -> str:
@@ -96,7 +96,7 @@ def written_body(env: Fleet) -> WrittenBody:
     slots = np.array(rows).reshape(-1, env.DESIGN_SIZE + 2)
     clearance = None
     if slots[:, -1].any():
-        lowest = np.array([_lowest(model) for model in models])
+        lowest = np.array([start_clearance(model) for model in models])
         clearance, error = _affine(designs, lowest)
         if error > EXACT:
             raise ValueError(f"the clearance of {type(env).__name__} at its start is not affine in its design")
@@ -190,13 +190,6 @@ def _affine(designs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]
     found: np.ndarray = np.linalg.lstsq(inputs, values, rcond=None)[0]
     fitted: np.ndarray = found.round(DIGITS) + 0.0  # no -0
     return fitted, float(np.abs(inputs @ fitted - values).max())
-
-
-def _lowest(model: mujoco.MjModel) -> float:
-    """Height in m of the lowest point in the start pose."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return lowest_point(model, data)
 
 
 def _number(value: float) -> str:

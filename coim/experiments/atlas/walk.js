@@ -91,6 +91,8 @@ class Simulation {
     };
     if (this.body.clearance === null) return compile(0);
     const [flat, pose] = compile(0);
+    // As coim.envs.simulation.start_clearance: some joints start beyond their ranges.
+    for (const [at, low, high] of this.body.ranges) pose.qpos[at] = Math.min(Math.max(pose.qpos[at], low), high);
     const clearance = [1, ...design].reduce((sum, value, i) => sum + value * this.body.clearance[i], 0);
     const start = clearance - lowestPoint(this.mujoco, flat, pose);
     flat.delete();

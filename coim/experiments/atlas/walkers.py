@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from coim.envs import MorphEnv
+from coim.envs.root import FREE
 from coim.envs.written_body import WrittenBody, written_body
 from coim.models import Policy
 
@@ -57,10 +58,19 @@ def body_table(bodies: MorphEnv) -> dict[str, Any]:
         "first_position": bodies.simulations.qpos.shape[1] - _num_positions(bodies),
         "height": bodies.root.height,
         "angles": list(bodies.angle_indices),
+        "ranges": _ranges(bodies),
         "names": list(bodies.design_names()),
         "low": bodies.design_bounds()[0].tolist(),
         "high": bodies.design_bounds()[1].tolist(),
     }
+
+
+def _ranges(bodies: MorphEnv) -> list[tuple[int, float, float]]:
+    """Place in the positions, least and largest value of each joint with limits, which are the same in all designs."""
+    model = bodies.simulations.model(0)
+    limited = np.flatnonzero((model.jnt_limited == 1) & (model.jnt_type != FREE))
+    places, (lows, highs) = model.jnt_qposadr[limited], model.jnt_range[limited].T
+    return list(zip(places.tolist(), lows.tolist(), highs.tolist()))
 
 
 def policy_table(policy: Policy) -> dict[str, Any]:

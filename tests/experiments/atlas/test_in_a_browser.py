@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from tiny_runs import run
 
 from coim import load_run
-from coim.envs import HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
+from coim.envs import AntMorph, HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
 from coim.experiments.atlas.walkers import body_table
 from coim.experiments.commands.atlas import main
 
@@ -27,6 +28,7 @@ BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 PACKAGE = os.environ.get("COIM_MUJOCO_WASM")
 FLAGS = ("headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking")
 FLAGS += ("disable-component-update", "disable-sync")
+STEPS = 4  # the next one drives the ant into the floor, which makes much of rounding
 SECONDS = 60.0  # to wait for a page on a busy machine
 
 pytestmark = pytest.mark.skipif(
@@ -112,7 +114,7 @@ def test_a_simulated_robot_moves_while_its_body_changes(walking: Any) -> None:
 
 
 @simulated
-@pytest.mark.parametrize("body", [HopperMorph, WalkerMorph, HalfCheetahMorph])
+@pytest.mark.parametrize("body", [HopperMorph, WalkerMorph, HalfCheetahMorph, AntMorph])
 def test_the_bodies_of_the_page_are_those_of_the_environment(walking: Any, body: type[MorphEnv]) -> None:
     env = body(seed=0)
     low, high = (bound.numpy() for bound in env.design_bounds())
@@ -128,6 +130,28 @@ def test_the_bodies_of_the_page_are_those_of_the_environment(walking: Any, body:
         wanted = env.simulations.body(design).compile()
         for field, values in zip(fields, found):
             np.testing.assert_allclose(values, getattr(wanted, field).ravel(), rtol=0, atol=1e-9, err_msg=field)
+
+
+@simulated
+@pytest.mark.parametrize("body", [HopperMorph, WalkerMorph, HalfCheetahMorph, AntMorph])
+def test_a_step_of_the_page_is_one_of_the_environment(walking: Any, body: type[MorphEnv]) -> None:
+    env = body(num_runs=1, reset_noise=0, seed=0)
+    low, high = env.design_bounds()
+    design = low + 0.7 * (high - low)
+    action = torch.linspace(-0.6, 0.8, env.action_spec.shape[-1])
+    wanted = [env.reset(TensorDict({"design": design[None]}, [1]))["observation"]]
+    wanted += [env.move(action[None])[0] for _ in range(STEPS)]
+    found = walking.execute_script(
+        "const robot = new Simulation(shown.mujoco, arguments[0], { act: () => arguments[2] }, arguments[1]);"
+        "const seen = [robot.observation()];"
+        "for (let i = 0; i < arguments[3]; i++) { robot.step(); seen.push(robot.observation()); }"
+        "return seen;",
+        body_table(env),
+        design.tolist(),
+        action.tolist(),
+        STEPS,
+    )
+    np.testing.assert_allclose(found, torch.cat(wanted), rtol=0, atol=1e-5)  # single precision there, double here
 
 
 @simulated
