@@ -83,6 +83,7 @@ class Graph:
             warnings.filterwarnings("ignore", ".*without CUDA graph capture")  # Adam's; the next call captures
             output = self._function(*inputs)
         here.wait_stream(aside)
+        output.record_stream(here)  # it was allocated for the other stream, and is read on this one
         self._warm = True
         return output
 
