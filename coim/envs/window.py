@@ -30,13 +30,15 @@ class Figure:
         self.model = dress(spec, PICTURE, PICTURE).compile()
         self.data = mujoco.MjData(self.model)
 
-    def pose(self, qpos: np.ndarray) -> None:
+    def pose(self, qpos: np.ndarray, *, qvel: np.ndarray | float = 0.0, ctrl: np.ndarray | float = 0.0) -> None:
         """Take a pose.
 
         Args:
             qpos: joint positions, ``[nq]``; the first ones are the place on the ground in m.
+            qvel: joint velocities, ``[nv]``; forces are those of this motion.
+            ctrl: of the motors, ``[nu]``.
         """
-        self.data.qpos[:] = qpos
+        self.data.qpos[:], self.data.qvel[:], self.data.ctrl[:] = qpos, qvel, ctrl
         for axis in range(self._travelled):  # as in `Camera.photograph`
             self.data.qpos[axis] = qpos[axis] % PERIOD
         mujoco.mj_forward(self.model, self.data)

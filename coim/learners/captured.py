@@ -60,6 +60,8 @@ class Graph:
 
     def __init__(self, function: Callable[..., Tensor], *, device: torch.device) -> None:
         self._function, self._device = function, device
+        # torch's own stream for captures is one of the device that captured first in the process.
+        self._aside = torch.cuda.Stream(device)
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -77,12 +79,12 @@ class Graph:
 
     def _call_aside(self, inputs: Iterable[Tensor]) -> Tensor:
         """Call on another stream, as `torch.cuda.CUDAGraph` asks for: libraries make their workspaces then."""
-        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
-        aside.wait_stream(here)
-        with torch.cuda.stream(aside), warnings.catch_warnings():
+        here = torch.cuda.current_stream()
+        self._aside.wait_stream(here)
+        with torch.cuda.stream(self._aside), warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*without CUDA graph capture")  # Adam's; the next call captures
             output = self._function(*inputs)
-        here.wait_stream(aside)
+        here.wait_stream(self._aside)
         output.record_stream(here)  # it was allocated for the other stream, and is read on this one
         self._warm = True
         return output
@@ -91,7 +93,7 @@ class Graph:
         self._inputs = [x.clone() for x in inputs]
         graph = torch.cuda.CUDAGraph()
         # What other threads of the process do on the device is none of this graph's.
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        with torch.cuda.graph(graph, stream=self._aside, capture_error_mode="thread_local"):
             self._output = self._function(*self._inputs)
         self._graph = graph
 
@@ -123,7 +125,7 @@ class FlatUpdates:
         self.captures = captures(weights.device)
         # Adam's fused kernel on CUDA reads it in float32, whatever the weights are.
         self._lr = torch.tensor(lr, dtype=torch.float32, device=weights.device) if self.captures else lr
-        self._graphs: dict[tuple[torch.Size, ...], Graph] = {}
+        self._graphs: dict[tuple[tuple[torch.Size, torch.dtype], ...], Graph] = {}
         self._captured: object = None
         self.optimiser = (torch.optim.Adam if self.captures else FlatAdam)(
             [weights], lr=self._lr, weight_decay=weight_decay, fused=True, capturable=self.captures
@@ -147,8 +149,8 @@ class FlatUpdates:
         return torch.stack([self._update(*rows) for rows in zip(*batches)])
 
     def _graph(self, batches: Iterable[Tensor]) -> Graph:
-        """The graph for batches of these sizes, so many of them."""
-        sizes = tuple(x.shape for x in batches)
+        """The graph for batches of these sizes and types, so many of them."""
+        sizes = tuple((x.shape, x.dtype) for x in batches)
         if sizes not in self._graphs:
             self._graphs[sizes] = Graph(self._one_by_one, device=self._weights.device)
         return self._graphs[sizes]

@@ -61,8 +61,9 @@ class SACLearner(FlatLearner):
         TypeError: if a network computes anything else than those of `coim.models` do, such as another activation.
 
     Note:
-        On CUDA an update is captured as a CUDA graph and replayed, until batches have another size. Where the
-        gradients are compiled, all batches must have one size.
+        On CUDA fifty updates at once are captured as a CUDA graph and replayed, after the first fifty, which are
+        launched one by one; a graph is kept for each size of batches. Where the gradients are compiled, all batches
+        must have one size.
 
         Moving the modules to another device or dtype afterwards, or giving them to another learner, parts them from the
         flat buffers; `update` refuses that.

@@ -15,7 +15,7 @@ from coim import HopperMorph
 from coim.events import Kind
 from coim.experiments.drawing.palette import KINDS
 from coim.experiments.report.run_report import write_report
-from coim.experiments.run.build import episodes_of_designs, make_buffers
+from coim.experiments.run.build import episodes_of_designs, first_designs, make_buffers
 from coim.experiments.run.command_line import parse
 from coim.experiments.run.settings import PRESETS, Settings
 
@@ -227,6 +227,14 @@ def test_a_run_can_begin_with_one_body_of_its_own(tmp_path: Path) -> None:
     rows = read(tmp_path / "evaluations.csv")
     assert [row["kind"] for row in rows] == ["first", "first", "optimised"]
     assert [float(rows[0][name]) for name in XI] == [0.8, 1.2, 1, 1.5]
+
+
+@pytest.mark.parametrize(
+    ("num_runs", "words"), [(1, "has 8 .*; give 4$"), (3, "has 8 .*; give 4, or 12 for a design of each of 3 runs")]
+)
+def test_a_first_body_has_all_factors_for_one_run_or_for_each(num_runs: int, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        first_designs(HopperMorph, Settings(first_design=(1.0,) * 8, num_runs=num_runs))
 
 
 @pytest.mark.parametrize("chosen_by", ["returns", "posterior"])

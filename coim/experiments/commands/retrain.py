@@ -64,7 +64,8 @@ def retrain(asked: Retrain) -> list[str]:
         except ValueError as error:
             raise ValueError(f"{error}; or move {folder} away to choose and train anew") from None
         waiting = len(ledger.in_state("waiting"))
-        print(f"{waiting} of {len(cells)} {'designs' if len(cells) == len(chosen) else 'fleets'} to train -> {folder}")
+        of = f" of {len(chosen)} designs" * (len(cells) < len(chosen))
+        print(f"{waiting} of {len(cells)} {'fleets' if of else 'designs'}{of} to train -> {folder}")
         if not waiting:
             return []
         print(f"{episodes_in_words(cells)} training episodes on each{'' if asked.episodes else DEFAULT}")

@@ -66,6 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if asked.live:
             show(asked, source)
             return
+        if asked.port != Watch.port:
+            raise ValueError(f"--port is of --live, leave it out without: {asked.port}")
         draw_without_screen()
         from coim.experiments.drawing.film import film, film_policy
 

@@ -1,7 +1,7 @@
 """A robot that walks in the browser until it is told to end: ``coim watch --live``.
 
 `mjviser <https://github.com/mujocolab/mjviser>`_ serves the page, which can pause, slow down, start again, turn the
-camera, and show contacts and forces.
+camera, and show contacts and forces. Its sliders of joints and motors do not reach the robot, which its policy drives.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Walk:
         self._bodies = taken.bodies(1, seed=0)
         self._observation = self._start()
         self.figure = Figure(self._bodies.simulations.body(taken.design.numpy()), root=self._bodies.root)
-        self.figure.model.opt.timestep = self._bodies.step_seconds
+        self._physics_seconds = self.figure.model.opt.timestep
         self.figure.model.stat.extent = EXTENT
         self._show()
 
@@ -88,4 +88,7 @@ class Walk:
         return state["observation"]
 
     def _show(self) -> None:
-        self.figure.pose(self._bodies.simulations.qpos[0])
+        simulations, options = self._bodies.simulations, self.figure.model.opt
+        options.timestep = self._physics_seconds  # how stiff a contact is depends on it
+        self.figure.pose(simulations.qpos[0], qvel=simulations.qvel[0], ctrl=simulations.ctrl[0])
+        options.timestep = self._bodies.step_seconds  # the page's clock reads it

@@ -30,6 +30,7 @@ from coim.experiments.report.axes import explain, mark_kinds
 from coim.experiments.report.designs import describe_correlation
 from coim.experiments.report.page import Section, Table, narrow
 from coim.experiments.run.records import Record, number
+from coim.experiments.run.resume import OF_NO_NUMBER
 
 MOST_PANELS = 4  # runs of one folder whose bodies are drawn and listed one by one
 RINGED: dict[str, Any] = {"s": 95, "facecolor": "none", "edgecolor": BLACK, "linewidth": 1.0, "zorder": 5}
@@ -59,7 +60,7 @@ def worth(records: Sequence[Record]) -> Section:
     rows: list[list[str]] = []
     found: list[tuple[str, Estimate]] = []
     notes: list[str] = []
-    alike: dict[str, list[list[float]]] = {}
+    alike: dict[str, dict[int | None, list[float]]] = {}
     for record in records:
         prefix = f"{record.name}, " if len(records) > 1 else ""
         gains: list[Estimate] = []
@@ -70,14 +71,17 @@ def worth(records: Sequence[Record]) -> Section:
         if len(gains) > 1:
             found.append((f"{prefix}mean of {len(gains)} runs", mean_of_runs([gain.value for gain in gains])))
             rows.append([found[-1][0], "", "", "", "", *_cells(found[-1][1])])
-        alike.setdefault(_less_seed(record), []).append([gain.value for gain in gains])
+        if gains:  # a folder that was copied, or repeated, is no further seed
+            own = alike.setdefault(_less_seed(record), {})
+            own.setdefault(record.settings.get("seed"), [gain.value for gain in gains])
         width = _width(record, gains)
         notes.append(f"{record.name}: {width}" if prefix else width)
     if not found:
         return Section(title=title, notes=notes)
-    for folders in alike.values():
-        if len(folders) > 1 and (values := [value for own in folders for value in own]):
-            name = f"mean of {len(values)} runs in {len(folders)} folders that differ in their seed alone"
+    for seeds in alike.values():
+        if len(seeds) > 1:
+            values = [value for own in seeds.values() for value in own]
+            name = f"mean of {len(values)} runs in {len(seeds)} folders that differ in their seed alone"
             found.append((name, mean_of_runs(values)))
             rows.append([name, "", "", "", "", *_cells(found[-1][1])])
     notes.append(
@@ -102,8 +106,7 @@ def worth(records: Sequence[Record]) -> Section:
 
 def _less_seed(record: Record) -> str:
     """The settings of a run, less its seed and what computes nothing."""
-    left_out = {"seed", "out", "resume", "name", "quiet", "threads", "checkpoint_every", "log", "wandb"}
-    left_out |= {"num_runs", "device"}
+    left_out = {"seed", *OF_NO_NUMBER} - {"num_designs"}
     return json.dumps({name: value for name, value in record.settings.items() if name not in left_out}, sort_keys=True)
 
 

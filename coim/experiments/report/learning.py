@@ -44,7 +44,7 @@ def learning_curves(records: Sequence[Record], body: type[MorphEnv] | None) -> S
     figure, (axes,) = new_figure(3.4)
     caption = "Return of the deterministic policy after each training episode."
     by_chance, lines = "", []
-    if body is not None:
+    if body is not None and len({_what_chance_meets(record) for record in records}) == 1:
         level = random_return(records[0], body)
         lines = [axes.axhline(level, color=GREY, linestyle=":", label="random actions on the first body")]
         by_chance = f" Random actions on the first body: {number(level)}."
@@ -70,6 +70,13 @@ def learning_curves(records: Sequence[Record], body: type[MorphEnv] | None) -> S
         alt="Return over training steps. Last mean: " + "; ".join(last) + f".{by_chance}",
         notes=points_in_words(records),
     )
+
+
+def _what_chance_meets(record: Record) -> tuple[object, ...]:
+    """What the return of random actions depends on: first bodies, task, and steps of an episode."""
+    first = record.designs[record.designs["design"] == record.designs["design"].min()]
+    bodies = {tuple(design) for design in designs_of(first).tolist()}
+    return (frozenset(bodies), *(record.settings.get(name) for name in ("task", "episode_steps")))
 
 
 def random_return(record: Record, body: type[MorphEnv]) -> float:

@@ -168,8 +168,17 @@ def first_designs(body: type[MorphEnv], settings: Settings) -> Sequence[Sequence
 
     Returns:
         ``[I][D]``, or ``[1][K][D]`` where each run has its own.
+
+    Raises:
+        ValueError: if there are neither as many numbers as one design has nor as many as one for each run.
     """
     asked, size = settings.first_design, body.DESIGN_SIZE
+    if len(asked) not in (0, size, size * settings.num_runs):
+        fleet = settings.num_runs > 1
+        each = f", or {size * settings.num_runs} for a design of each of {settings.num_runs} runs" if fleet else ""
+        raise ValueError(
+            f"first_design has {len(asked)} number(s), a design of this body has {size}; give {size}{each}"
+        )
     if len(asked) > size and len(asked) == size * settings.num_runs:
         return [[list(asked[i : i + size]) for i in range(0, len(asked), size)]]
     return [asked] if asked else body.FIRST_DESIGNS

@@ -17,7 +17,7 @@ So the best half of each run is retrained, and a mean for each run is the sample
 passes one threshold is alike, and less is left of how much runs differ. Five runs are few for a bootstrap.
 
 A body that several runs chose counts as often as it was chosen: an arm that always proposes a good one has earned it,
-and each is retrained with its own seed.
+and each is retrained by itself, with weights of its own.
 """
 
 from __future__ import annotations

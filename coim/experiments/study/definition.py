@@ -224,8 +224,9 @@ def refuse_unbuildable(cell: Cell) -> None:
     if design and not fits:
         raise ValueError(
             f"first_design is {design}, a design of {cell.environment} has {body.DESIGN_SIZE} scale factors from "
-            f"{low[0] if len(set(low)) == 1 else low} to {high[0] if len(set(high)) == 1 else high}; write such, and "
-            "one for each environment in the overrides of a block of its own"
+            f"{low[0] if len(set(low)) == 1 else low} to {high[0] if len(set(high)) == 1 else high}; write such, "
+            f"or {sizes[1]} numbers, one design for each of the {cell.settings.num_runs} run(s) of the cell with seed "
+            f"{cell.settings.seed}, and one for each environment in the overrides of a block of its own"
         )
 
 

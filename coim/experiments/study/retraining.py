@@ -17,8 +17,9 @@ import tyro
 
 from coim.experiments.frames import at, designs_of, read_frame, rows_of
 from coim.experiments.run.atomic_write import as_csv, shortest, write_whole
+from coim.experiments.run.effect import without_effect
 from coim.experiments.run.last_words import plain_sac
-from coim.experiments.run.resume import saved_settings
+from coim.experiments.run.resume import ELSEWHERE, FREE, changes, saved_settings
 from coim.experiments.study.definition import Cell
 from coim.experiments.study.runs import CHOSEN, Place, Run, Runs, trained_in
 
@@ -82,8 +83,8 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> pd.DataFrame:
         All rows of the file, with the columns of `CHOSEN`.
 
     Raises:
-        ValueError: if an arm is none of the study's, none has a design to choose from, or what stands in the file was
-            chosen by another rule.
+        ValueError: if an arm is none of the study's, none has a design to choose from, what stands in the file was
+            chosen by another rule, or designs that are to be trained together were found with different settings.
     """
     listed = read_frame(path, CHOSEN)
     for arm in asked.arms:
@@ -105,6 +106,8 @@ def choose(runs: Runs, path: Path, asked: Retrain) -> pd.DataFrame:
     for place, arm in itertools.product(runs.places, arms):
         if arm in runs.arms_at(place) and at(chosen, place, arm).empty:
             print(f"{', '.join(place)}: no run of {arm} has {WORDS[rule['of']]}, there is nothing to retrain of it")
+    # Refuses before anything is written.
+    cells_of((line for line in rows_of(chosen) if trained_in(line)[0] != line["folder"]), asked)
     noted = chosen.replace("", math.nan).dropna(axis="columns", how="all")  # older studies have noted less
     cells = noted.map(lambda value: shortest(value) if isinstance(value, float) else value, na_action="ignore")
     write_whole(path, as_csv(list(cells.columns), rows_of(cells.fillna(""))))
@@ -215,11 +218,14 @@ def cell_of(folder: str, lines: Sequence[Mapping[str, Any]], asked: Retrain) -> 
         )
         for line in lines
     ]
-    if unlike := next((line["cell"] for line, settings in zip(lines, each) if settings != each[0]), None):
-        raise ValueError(
-            f"the designs of {folder} cannot be trained together: cell {unlike} has other settings than "
-            f"{lines[0]['cell']}; choose anew with --together 1, after deleting {asked.study}/retrained"
-        )
-    episodes = each[0].first_episodes if asked.episodes is None else asked.episodes
-    settings = dataclasses.replace(each[0], first_episodes=episodes)
-    return Retraining(lines[0]["environment"], lines[0]["arm"], settings, 0, folder)
+    if asked.episodes is not None:
+        each = [dataclasses.replace(settings, first_episodes=asked.episodes) for settings in each]
+    for line, settings in zip(lines, each):
+        # Where a cell was computed, and what plain SAC does not read, makes no difference to its designs.
+        of_no_effect = {*FREE, *ELSEWHERE, *without_effect(dataclasses.replace(settings, bodies="fixed"))}
+        if unlike := sorted(changes(each[0], settings).keys() - of_no_effect):
+            raise ValueError(
+                f"the designs of {folder} cannot be trained together: cells {lines[0]['cell']} and {line['cell']} "
+                f"differ in {', '.join(unlike)}; leave --together out to train each by itself"
+            )
+    return Retraining(lines[0]["environment"], lines[0]["arm"], each[0], 0, folder)

@@ -10,9 +10,9 @@ import time
 import urllib.request
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
-import torch
 
 from coim import run_episode
 from coim.envs.camera import PERIOD
@@ -36,9 +36,23 @@ def test_what_is_shown_is_the_episode_of_the_policy() -> None:
     joints = len(walk.figure.data.qpos) - 1  # without the place on the ground
     np.testing.assert_allclose([pose[1:] for pose in shown], expected[:, 0, :joints], atol=1e-6)
     assert walk.figure.model.opt.timestep == alone.step_seconds
+    assert all(0 <= pose[0] < PERIOD for pose in shown)
     walk.reset()
-    assert 0 <= walk.figure.data.qpos[0] < PERIOD
-    assert torch.isfinite(torch.from_numpy(walk.figure.data.xpos)).all()
+    assert np.abs(walk.figure.data.qpos - shown[-1]).max() > 0.02
+    np.testing.assert_allclose(walk.figure.data.qpos[1:], shown[0][1:], atol=0.02)  # as it stood before
+
+
+def test_forces_that_are_shown_are_those_of_the_walk() -> None:
+    walk = Walk(take(policy_file("hopper"), "best", run=None, policy=None, body=None))
+    while not walk.figure.data.ncon:
+        walk.step()
+    simulations = walk._bodies.simulations
+    model = simulations.model(0)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = simulations.qpos[0], simulations.qvel[0], simulations.ctrl[0]
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.qfrc_constraint).max() > 100
+    np.testing.assert_allclose(walk.figure.data.qfrc_constraint, data.qfrc_constraint, rtol=1e-4, atol=1e-2)
 
 
 def test_the_page_is_served_until_it_is_told_to_end(tmp_path: Path) -> None:
@@ -66,6 +80,11 @@ def test_the_page_is_served_until_it_is_told_to_end(tmp_path: Path) -> None:
 def test_what_is_of_a_film_is_refused(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit, match="--steps, --width is of a film: leave it out with --live"):
         main(["--pretrained", "hopper", "--live", "--steps", "9", "--width", "64"])
+
+
+def test_a_port_is_of_the_page_alone() -> None:
+    with pytest.raises(SystemExit, match="--port is of --live, leave it out without"):
+        main(["--pretrained", "hopper", "--port", "9"])
 
 
 def test_without_mjviser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

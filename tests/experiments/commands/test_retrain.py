@@ -170,9 +170,35 @@ def test_designs_of_an_arm_are_trained_together_each_with_a_body_of_its_own(stud
     bodies = [float(factor) for xi in chosen["xi"] for factor in xi.split()]
     assert (two.name, two.settings.num_runs) == ("hopper-forward-known-fleet0", 2)
     assert [*two.settings.first_design, *one.settings.first_design] == bodies
-    settings_of(study, "hopper-forward-known-2", lr=0.002)
-    with pytest.raises(ValueError, match=r"fleet0 cannot be trained together: .* has other settings.*--together 1"):
-        cells_of(chosen.to_dict("records"), asked)
+
+
+def test_bodies_found_with_other_settings_are_not_trained_together_and_nothing_is_written(study: Path) -> None:
+    asked = Retrain(study=study, arms=("known",), most=3, together=2)
+    for seed in range(3):
+        settings_of(study, f"hopper-forward-known-{seed}", lr=0.002 if seed == 2 else 0.001)
+    with pytest.raises(ValueError, match=r"fleet0 cannot be trained together: .* differ in lr; leave --together out"):
+        choose(read_runs(study), study / "chosen.csv", asked)
+    assert not (study / "chosen.csv").exists()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"threads": 2}, {"compile": False}, {"checkpoint_every": 7}, {"num_iterations": 9, "search": "swarm"}],
+    ids=lambda other: next(iter(other)),
+)
+def test_where_a_cell_was_computed_does_not_keep_its_body_from_a_fleet(study: Path, other: dict) -> None:
+    for seed in range(3):
+        settings_of(study, f"hopper-forward-known-{seed}", **other if seed == 2 else {})
+    chosen = choose(read_runs(study), study / "chosen.csv", Retrain(study=study, arms=("known",), most=3, together=3))
+    assert len(chosen) == 3
+
+
+def test_bodies_that_their_studies_gave_other_numbers_of_episodes_may_share_a_number_that_is_given(study: Path) -> None:
+    for seed in range(3):
+        settings_of(study, f"hopper-forward-known-{seed}", first_episodes=300 + seed)
+    asked = Retrain(study=study, arms=("known",), most=3, together=3, episodes=9)
+    (fleet,) = cells_of(choose(read_runs(study), study / "chosen.csv", asked).to_dict("records"), asked)
+    assert fleet.settings.first_episodes == 9
 
 
 def test_what_cannot_be_asked_for_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:

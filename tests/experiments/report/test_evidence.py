@@ -78,6 +78,14 @@ def test_folders_that_differ_in_their_seed_alone_have_a_mean_over_all_their_runs
     assert rows[-1][-2:] == ["150", "-485.3 to 785.3"]  # of 200 and 100: 150 -+ 12.7 x 50
 
 
+def test_a_folder_that_was_copied_or_has_no_gain_yet_makes_no_mean_over_seeds(tmp_path: Path) -> None:
+    whole = (*RETURNS, 250.0)
+    folders = [write_run(tmp_path / name, whole, seed=0) for name in ("run", "copy")]
+    folders.append(write_run(tmp_path / "begun", RETURNS[:4], seed=1))
+    names = [row[0] for row in shown(worth(read_records(folders))).tables[0].rows]
+    assert names == ["run, run 0", "copy, run 0"]
+
+
 def test_without_a_search_there_is_nothing_to_compare(tmp_path: Path) -> None:
     found = {
         "bodies were not searched": write_run(tmp_path / "random", RETURNS, bodies="random"),

@@ -199,6 +199,15 @@ def test_a_retraining_that_diverged_later_counts_with_what_it_had(tmp_path: Path
     assert "lowest" not in designs.notes[2]
 
 
+def test_each_run_of_a_fleet_retrains_a_design_of_its_own(tmp_path: Path) -> None:
+    lines = write_retrained(tmp_path, {"known": of_seeds(4, 5)}, trained="")
+    fleet = "hopper-forward-known-fleet0"
+    write_cell(tmp_path, fleet, [7], [9], part="retrained/cells", num_designs=1)
+    list_designs(tmp_path, [line | {"trained": f"{fleet}/{run}"} for run, line in enumerate(lines)])
+    designs, _ = drawn(tmp_path)
+    assert [(row["seed"], row["best_return"]) for row in designs.rows] == [(0, 7), (1, 9)]
+
+
 def test_where_no_retraining_has_a_return_designs_are_left_out_and_counted(tmp_path: Path) -> None:
     lost = {"none": of_seeds(math.nan), "known": of_seeds(math.nan, math.nan)}
     lines = write_retrained(tmp_path, lost)
