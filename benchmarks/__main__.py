@@ -22,7 +22,7 @@ from benchmarks.memory import memory
 from benchmarks.model import ensemble, imagination
 from benchmarks.rivals import sb3, sbx
 from benchmarks.search import search
-from benchmarks.updates import torchrl, update
+from benchmarks.updates import together, torchrl, update
 from coim.experiments.run.atomic_write import dated_file
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import available_cores, prepare
@@ -31,6 +31,7 @@ Row = Literal[
     "products",
     "libraries",
     "update",
+    "together",
     "torchrl",
     "sb3",
     "sbx",
@@ -45,6 +46,7 @@ ROWS: dict[Row, Callable[[Effort], list[Figure]]] = {
     "products": products,
     "libraries": libraries,
     "update": update,
+    "together": together,
     "torchrl": torchrl,
     "sb3": sb3,
     "sbx": sbx,

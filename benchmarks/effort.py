@@ -19,6 +19,8 @@ class Effort:
     """K, runs that one learner updates."""
     fleets: tuple[int, ...] = (1, 16, 64)
     """K, bodies that step together."""
+    together: int = 8
+    """K, runs with small networks that one learner updates."""
 
     # -- updates and imagination --------------------------------------------------------------------------------------
     batch_size: int = 256
@@ -58,6 +60,7 @@ class Effort:
 
 
 FULL = Effort()
+SMALL = (64, 64, 64)  # hidden units of policy and critics in the protocol "pilot"
 
 QUICK = Effort(
     repeats=3,

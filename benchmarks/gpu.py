@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import torch
 import tyro
 
-from benchmarks.effort import Effort
+from benchmarks.effort import SMALL, Effort
 from benchmarks.iteration import Iterations
 from benchmarks.measure import Figure, interleaved, over
 from benchmarks.missing import missing
@@ -36,7 +36,6 @@ from coim.experiments.run.machine import available_cores, prepare
 from coim.experiments.run.settings import Settings
 
 EFFORT = Effort(repeats=5, long_repeats=2, runs=(1, 16, 64, 256), fleets=(1, 16, 64), updates=100)
-SMALL = (64, 64, 64)  # hidden units of the protocol "pilot"
 TINY = Effort(
     repeats=1,
     long_repeats=1,

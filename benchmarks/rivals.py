@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.util
 from collections.abc import Callable
@@ -12,12 +13,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from benchmarks.effort import Effort
+from benchmarks.effort import SMALL, Effort
 from benchmarks.floors import alone
 from benchmarks.fresh import in_fresh_process
 from benchmarks.measure import Figure, Target, interleaved, over
 from benchmarks.parts import REPLAY_ROWS, body_sizes, replay, update_products
-from benchmarks.updates import our_updates, plural, too_few_cores
+from benchmarks.updates import our_updates, plural, small_networks, too_few_cores
 from coim import HalfCheetahMorph
 from coim.experiments.run.machine import available_cores
 
@@ -30,26 +31,27 @@ def sb3(effort: Effort) -> list[Figure]:
 
 
 def sbx(effort: Effort) -> list[Figure]:
-    """SBX's `SAC.train`, JAX, all updates in one jitted call."""
-    return _against("sbx", effort)
+    """SBX's `SAC.train`, JAX, all updates in one jitted call; also with small networks."""
+    small = dataclasses.replace(effort, num_cells=SMALL)
+    return _against("sbx", effort) + _against("sbx", small, of=f"update of {small_networks()}")
 
 
-def _against(rival: str, effort: Effort) -> list[Figure]:
+def _against(rival: str, effort: Effort, *, of: str = "update") -> list[Figure]:
     """JAX takes its threads from the cores of the process: one process for each number of threads."""
     module, name = RIVALS[rival]
     found = []
     for count in effort.threads:
-        row = f"update, {plural(count)}, K = 1, float32"
+        row = f"{of}, {plural(count)}, K = 1, float32"
         if importlib.util.find_spec(module) is None:
             found.append(Figure(row=row, against=name, note="not installed; `make bench` installs it"))
         elif count > available_cores():
             found.append(Figure(row=row, against=name, note=too_few_cores(count)))
         else:
-            found += in_fresh_process(partial(measure, rival, count), effort, cores=count)
+            found += in_fresh_process(partial(measure, rival, count, row), effort, cores=count)
     return found
 
 
-def measure(rival: str, count: int, effort: Effort) -> list[Figure]:
+def measure(rival: str, count: int, row: str, effort: Effort) -> list[Figure]:
     """To be run in a process that is confined to so many cores."""
     name = RIVALS[rival][1]
     times = interleaved(
@@ -63,7 +65,7 @@ def measure(rival: str, count: int, effort: Effort) -> list[Figure]:
     ours, theirs = (median(over(times[who], times["floor"])) for who in ("ours", "theirs"))
     return [
         Figure(
-            row=f"update, {plural(count)}, K = 1, float32",
+            row=row,
             against=name,
             ratios=over(times["ours"], times["theirs"]),
             amounts=tuple(1e3 * seconds / effort.updates for seconds in times["ours"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from statistics import median
 
@@ -12,7 +13,7 @@ from torch import nn
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from benchmarks.effort import Effort
+from benchmarks.effort import SMALL, Effort
 from benchmarks.floors import alone
 from benchmarks.measure import Figure, Target, interleaved, over, threads
 from benchmarks.parts import body_sizes, replay, sac_learner, update_products
@@ -22,6 +23,7 @@ from coim.learners.flat_weights import Precision
 from coim.products import chosen, kind_of_processor
 
 FLOOR = "floor"
+COMPILED, EAGER = "compiled", "not compiled"
 PRODUCTS_BY = "{:.2f} x the same products by coim.products"
 
 
@@ -65,6 +67,41 @@ def _update(effort: Effort, count: int, runs: int) -> list[Figure]:
         )
         for name in candidates
     ]
+
+
+def together(effort: Effort) -> list[Figure]:
+    """Small networks: several runs that one learner updates, against one run at a time."""
+    effort, runs = dataclasses.replace(effort, num_cells=SMALL), effort.together
+    with threads(1):
+        buffers = {count: replay(count) for count in (1, runs)}
+        times = interleaved(
+            {"floor": alone(update_products(effort), times=effort.updates)}
+            | {
+                f"{count}, {way}": our_updates(buffer, effort, effort.updates, num_runs=count, compile=way == COMPILED)
+                for count, buffer in buffers.items()
+                for way in (COMPILED, EAGER)
+            },
+            effort.repeats,
+        )
+    alone_ms = {way: median(times[f"1, {way}"]) / effort.updates * 1e3 for way in (COMPILED, EAGER)}
+    floor = median(over(times[f"1, {COMPILED}"], times["floor"]))
+    return [
+        Figure(
+            row=f"update of {small_networks()}, {plural(1)}, K = {runs}, float32{suffix}",
+            against=f"{runs} runs, one at a time",
+            ratios=tuple(ratio / runs for ratio in over(times[f"{runs}, {way}"], times[f"1, {way}"])),
+            amounts=tuple(1e3 * seconds / (effort.updates * runs) for seconds in times[f"{runs}, {way}"]),
+            unit="ms per run",
+            target=Target(0.4) if way == COMPILED else None,
+            note=f"one alone takes {alone_ms[way]:.2f} ms" + (f", {floor:.2f} x floor" if way == COMPILED else ""),
+        )
+        for way, suffix in ((COMPILED, ""), (EAGER, ", not compiled"))
+    ]
+
+
+def small_networks() -> str:
+    """How rows call them."""
+    return f"{len(SMALL)} x {SMALL[0]} units"
 
 
 def our_updates(
