@@ -14,6 +14,7 @@ import tyro
 
 from benchmarks import table
 from benchmarks.bodies import bodies
+from benchmarks.compiling import compiling
 from benchmarks.effort import FULL, QUICK, Effort
 from benchmarks.iteration import iteration
 from benchmarks.libraries import libraries, products
@@ -41,6 +42,7 @@ Row = Literal[
     "bodies",
     "iteration",
     "memory",
+    "compiling",
 ]
 ROWS: dict[Row, Callable[[Effort], list[Figure]]] = {
     "products": products,
@@ -56,6 +58,7 @@ ROWS: dict[Row, Callable[[Effort], list[Figure]]] = {
     "bodies": bodies,
     "iteration": iteration,
     "memory": memory,
+    "compiling": compiling,
 }
 
 

@@ -1,4 +1,4 @@
-"""Compiling a function of tensors as a whole, by `torch.compile`, for more than one thread.
+"""Compiling a function of tensors as a whole, by `torch.compile`, for more than one thread, learner and process.
 
 On a CPU Inductor's C++ wrapper is taken: it calls the products without Python between them, and lets other threads of
 Python run meanwhile.
@@ -7,12 +7,16 @@ Python run meanwhile.
 from __future__ import annotations
 
 import functools
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
+from torch.utils._pytree import tree_flatten
 
+from coim.kept_code import keep, kept
 from coim.products import Choice, chosen
 
 P = ParamSpec("P")
@@ -20,6 +24,7 @@ R = TypeVar("R")
 
 # Options of Inductor are process-wide while it compiles: one thread at a time.
 _COMPILING = threading.Lock()
+_MADE: dict[Hashable, Callable[..., Any]] = {}
 
 
 def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
@@ -39,7 +44,9 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
 
     Note:
         Compiling takes seconds to a minute and needs a C++ compiler. Nothing falls back to the plain function: what
-        cannot be compiled raises torch's own error.
+        cannot be compiled raises torch's own error. A function that has a name in its module is compiled once for all
+        who compile it for tensors of the same sizes; one of coim, on a CPU, also for later processes, see
+        `coim.kept_code`.
 
         What is called afterwards is the compiled code itself. `torch.compile` looks for it anew in every call, by a
         hook in the interpreter; in torch 2.13 that failed once ("found no compiled frames") in a run whose learners
@@ -53,19 +60,58 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
     """
     quick: dict[Choice, Callable[P, R]] = {}
 
-    def compiled_for(*inputs: object) -> Callable[P, R]:
-        options: dict[str, Any] = {"cpp_wrapper": device.type == "cpu"}
-        with torch._dynamo.config.patch(enable_aot_compile=True):  # off by default in torch 2.11
-            slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options=options)
-            return slow.aot_compile(inputs)
-
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         products = chosen()
         if products not in quick:
             with _COMPILING:
                 if products not in quick:
-                    quick[products] = compiled_for(args, kwargs)
+                    quick[products] = _code_for(function, device, args, kwargs)
         return quick[products](*args, **kwargs)
 
     return call
+
+
+def _code_for(
+    function: Callable[P, R], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Callable[P, R]:
+    """The code for such inputs: of this process, of an earlier one, or made now."""
+    name = f"{function.__module__}.{function.__qualname__}"
+    if getattr(sys.modules.get(function.__module__), function.__qualname__, None) is not function:
+        return _compile(function, device, args, kwargs)  # a local function: its name does not say what it does
+    key = (name, device.type, chosen(), torch.get_num_threads(), described(args, kwargs))
+    if key not in _MADE:
+        # A card's code was never tried in another process.
+        code = kept(function, key, args, kwargs) if device.type == "cpu" else None
+        if code is None:
+            code = _compile(function, device, args, kwargs)
+            if device.type == "cpu":
+                keep(code, function, key)
+        _MADE[key] = code
+    return _MADE[key]
+
+
+def _compile(function: Callable[P, R], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    options: dict[str, Any] = {"cpp_wrapper": device.type == "cpu"}
+    with torch._dynamo.config.patch(enable_aot_compile=True):  # off by default in torch 2.11
+        slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options=options)
+        return slow.aot_compile((args, kwargs))
+
+
+def described(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Hashable:
+    """What code is compiled for: sizes, types and devices of tensors, which of them are the same, all else as it is.
+
+    Example:
+        >>> x, y = torch.zeros(2), torch.ones(2)
+        >>> described((x, y), {}) == described((y, x), {}), described((x, x), {}) == described((x, y), {})
+        (True, False)
+    """
+    leaves, structure = tree_flatten((args, kwargs))
+    places = [id(leaf) for leaf in leaves]
+    tensors = tuple(
+        (tuple(x.shape), x.stride(), str(x.dtype), str(x.device), x.requires_grad, places.index(id(x)))
+        if isinstance(x, Tensor)
+        else repr(x)
+        for x in leaves
+    )
+    return tensors, str(structure), torch.is_grad_enabled()

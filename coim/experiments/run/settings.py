@@ -148,7 +148,7 @@ class Settings:
     products: Literal["auto", "onednn", "torch"] = "auto"
     """Library that multiplies on the CPU; auto takes the fastest known. A resumed run keeps the one it has."""
     compile: bool = False
-    """Compile the gradients with torch.compile: up to a minute at the start, then faster. On in both presets."""
+    """Compile the gradients with torch.compile: up to a minute at the first start, then faster. On in both presets."""
     device: str = "cpu"
     """Device of the networks: cpu, cuda, cuda:1, ..."""
     replay_device: Literal["same", "cpu"] = "same"

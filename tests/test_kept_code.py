@@ -1,0 +1,152 @@
+"""Compiled code that a later process finds again, and when it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from coim import SACLearner, compiling, kept_code, make_policy, make_qvalue, products
+from coim.compiling import compiled
+from coim.products import affine
+
+CPU = torch.device("cpu")
+INPUTS = torch.linspace(-1, 1, 12).reshape(4, 3), torch.linspace(0, 2, 6).reshape(3, 2), torch.ones(2)
+
+
+@pytest.fixture(autouse=True)
+def compilations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A folder of compiled code for each test, in a process that has none; and what was compiled."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    made: list[str] = []
+    compile = compiling._compile
+
+    def counted(function: Any, *rest: Any) -> Any:
+        made.append(function.__name__)
+        return compile(function, *rest)
+
+    monkeypatch.setattr(compiling, "_compile", counted)
+    monkeypatch.setattr(compiling, "_MADE", {})
+    return made
+
+
+@pytest.fixture(autouse=True)
+def settled_sources(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Whoever works on coim while its tests run has a file that is newer than the process."""
+    monkeypatch.setattr(kept_code, "_IMPORTED", float("inf"))
+    digest = kept_code._digest_of_sources
+    digest.cache_clear()
+    yield
+    digest.cache_clear()
+
+
+def in_a_new_process(*inputs: torch.Tensor) -> torch.Tensor:
+    """Call `affine`, compiled, as a process does that has compiled nothing yet."""
+    compiling._MADE.clear()
+    with torch.no_grad():
+        return compiled(affine, CPU)(*inputs)
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted((folder / "coim").iterdir()) if (folder / "coim").exists() else []
+
+
+def test_a_later_process_finds_the_code_and_gets_the_same_bits(tmp_path: Path, compilations: list[str]) -> None:
+    first, second = in_a_new_process(*INPUTS), in_a_new_process(*INPUTS)
+    assert compilations == ["affine"]
+    assert len(files(tmp_path)) == 1
+    assert torch.equal(first, second)
+    torch.testing.assert_close(first, affine(*INPUTS))
+
+
+def test_kept_code_refuses_other_shapes_too(compilations: list[str]) -> None:
+    in_a_new_process(*INPUTS)
+    compiling._MADE.clear()
+    quick = compiled(affine, CPU)
+    with torch.no_grad():
+        quick(*INPUTS)
+        with pytest.raises(RuntimeError, match="expected 4, actual 5"):
+            quick(torch.zeros(5, 3), *INPUTS[1:])
+    assert compilations == ["affine"]
+
+
+def test_other_sizes_threads_products_and_sources_are_other_code(
+    tmp_path: Path, compilations: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_a_new_process(*INPUTS)
+    in_a_new_process(torch.zeros(5, 3), *INPUTS[1:])
+    threads, choice = torch.get_num_threads(), products.chosen()
+    try:
+        torch.set_num_threads(threads + 1)
+        in_a_new_process(*INPUTS)
+        torch.set_num_threads(threads)
+        products.use("onednn" if choice.float32 == "torch" else "torch")
+        in_a_new_process(*INPUTS)
+    finally:
+        torch.set_num_threads(threads)
+        products.use(choice)
+    monkeypatch.setattr(kept_code, "_digest_of_sources", lambda: "of another revision")
+    in_a_new_process(*INPUTS)
+    assert len(compilations) == len(files(tmp_path)) == 5
+
+
+@pytest.mark.parametrize("content", [b"", b"no compiled code"])
+def test_what_cannot_be_read_is_compiled_anew(tmp_path: Path, compilations: list[str], content: bytes) -> None:
+    first = in_a_new_process(*INPUTS)
+    (file,) = files(tmp_path)
+    file.write_bytes(content)
+    assert torch.equal(in_a_new_process(*INPUTS), first)
+    assert torch.equal(in_a_new_process(*INPUTS), first)
+    assert compilations == ["affine"] * 2  # what was made anew is kept
+
+
+def test_nothing_is_kept_of_sources_that_changed_under_the_process(
+    tmp_path: Path, compilations: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kept_code, "_IMPORTED", 0.0)
+    in_a_new_process(*INPUTS)
+    in_a_new_process(*INPUTS)
+    assert compilations == ["affine"] * 2
+    assert not files(tmp_path)
+
+
+def of_somebody_else(x: torch.Tensor) -> torch.Tensor:
+    return x.tanh()
+
+
+def test_nothing_is_kept_of_functions_of_others(tmp_path: Path, compilations: list[str]) -> None:
+    with torch.no_grad():
+        assert compiled(of_somebody_else, CPU)(torch.zeros(2)).tolist() == [0, 0]
+        assert compiled(of_somebody_else, CPU)(torch.zeros(2)).tolist() == [0, 0]
+    assert compilations == ["of_somebody_else"]  # in this process it is shared
+    assert not files(tmp_path)
+
+
+def test_a_full_disk_takes_nothing_from_a_run(
+    tmp_path: Path, compilations: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: Path, target: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("coim.kept_code.os.replace", full)
+    torch.testing.assert_close(in_a_new_process(*INPUTS), affine(*INPUTS))
+    assert not files(tmp_path)
+
+
+def test_learners_of_equal_networks_share_their_code(
+    toy_env: Any, make_rows: Any, compilations: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        compiling, "_compile", lambda function, *rest: compilations.append(function.__name__) or function
+    )
+    rows = make_rows(1, 8, dtype=torch.float32)
+    learners = [
+        SACLearner(make_policy(toy_env, num_cells=(4,)), make_qvalue(toy_env, num_cells=(4,)), compile=True, seed=seed)
+        for seed in range(2)
+    ]
+    found = [learner.update(rows)["loss_qvalue"] for learner in learners]
+    assert compilations == ["sac_gradients"]
+    assert not torch.equal(*found)
