@@ -6,11 +6,10 @@ Python run meanwhile.
 
 from __future__ import annotations
 
-import functools
 import sys
 import threading
 from collections.abc import Callable, Hashable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,23 +23,22 @@ R = TypeVar("R")
 
 # Options of Inductor are process-wide while it compiles: one thread at a time.
 _COMPILING = threading.Lock()
-_MADE: dict[Hashable, Callable[..., Any]] = {}
+_MADE: dict[Hashable, Any] = {}
 
 
-def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
-    """Compile a function on its first call.
+class Compiled(Generic[P, R]):
+    """A function of tensors that is compiled on its first call, with the same results up to rounding.
+
+    It may be called by several threads; whoever calls first compiles, the others wait. Later calls must have the shapes
+    and dtypes of the first. Where `coim.products.use` has chosen other products since, it is compiled anew, once for
+    each choice.
 
     Args:
         function: of tensors, without side effects and without branches on their values.
         device: of the tensors.
 
-    Returns:
-        A function with the same results up to rounding. It may be called by several threads; whoever calls first
-        compiles, the others wait. Later calls must have the shapes and dtypes of the first. Where `coim.products.use`
-        has chosen other products since, it is compiled anew, once for each choice.
-
     Raises:
-        RuntimeError: by the returned function, if a call has other shapes; torch names the tensor.
+        RuntimeError: by a call, if it has other shapes; torch names the tensor.
 
     Note:
         Compiling takes seconds to a minute and needs a C++ compiler. Nothing falls back to the plain function: what
@@ -54,27 +52,41 @@ def compiled(function: Callable[P, R], device: torch.device) -> Callable[P, R]:
 
     Example:
         >>> import torch
-        >>> quick = compiled(lambda x: x.tanh().square(), torch.device("cpu"))
+        >>> quick = Compiled(lambda x: x.tanh().square(), torch.device("cpu"))
         >>> quick(torch.zeros(2))
         tensor([0., 0.])
     """
-    quick: dict[Choice, Callable[P, R]] = {}
 
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+    def __init__(self, function: Callable[P, R], device: torch.device) -> None:
+        self._function, self._device = function, device
+        self._code: dict[Choice, Any] = {}
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return self._code_for(args, kwargs)(*args, **kwargs)
+
+    def checked(self, *args: P.args, **kwargs: P.kwargs) -> Callable[P, R]:
+        """Check these inputs, and return code for others of the same shapes and types, which checks nothing any more.
+
+        For calls that cannot differ: with networks of 3 x 64 a check is one part in thirty of an update.
+
+        Raises:
+            RuntimeError: if the inputs have other shapes than the first ones had.
+        """
+        code = self._code_for(args, kwargs)
+        if not code.guard_check(*args, **kwargs):
+            code(*args, **kwargs)  # raises, and names the tensor
+        return code.fn
+
+    def _code_for(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         products = chosen()
-        if products not in quick:
+        if products not in self._code:
             with _COMPILING:
-                if products not in quick:
-                    quick[products] = _code_for(function, device, args, kwargs)
-        return quick[products](*args, **kwargs)
-
-    return call
+                if products not in self._code:
+                    self._code[products] = _code_for(self._function, self._device, args, kwargs)
+        return self._code[products]
 
 
-def _code_for(
-    function: Callable[P, R], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> Callable[P, R]:
+def _code_for(function: Callable[..., Any], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """The code for such inputs: of this process, of an earlier one, or made now."""
     name = f"{function.__module__}.{function.__qualname__}"
     if getattr(sys.modules.get(function.__module__), function.__qualname__, None) is not function:
@@ -91,7 +103,7 @@ def _code_for(
     return _MADE[key]
 
 
-def _compile(function: Callable[P, R], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+def _compile(function: Callable[..., Any], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     options: dict[str, Any] = {"cpp_wrapper": device.type == "cpu"}
     with torch._dynamo.config.patch(enable_aot_compile=True):  # off by default in torch 2.11
         slow: Any = torch.compile(function, fullgraph=True, dynamic=False, options=options)

@@ -18,7 +18,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from coim.compiling import compiled
 from coim.learners.flat_weights import FlatLearner, Precision
 from coim.learners.known_networks import check_ensemble
 from coim.learners.rows import on_device, runs_first
@@ -78,9 +77,16 @@ class DynamicsLearner(FlatLearner):
         self.ensemble = ensemble
         self.loss = EnsembleNLLLoss(ensemble, num_runs=num_runs)
         networks = {"ensemble": ensemble.network}
-        super().__init__(networks, lr=lr, weight_decay=weight_decay, num_runs=num_runs, precision=precision)
+        super().__init__(
+            networks,
+            dynamics_gradients,
+            lr=lr,
+            weight_decay=weight_decay,
+            num_runs=num_runs,
+            precision=precision,
+            compile=compile,
+        )
         self._cut_networks()
-        self._find = compiled(dynamics_gradients, self._weights.device) if compile else dynamics_gradients
 
     def observe(self, rows: TensorDictBase) -> None:
         """Add new rows of Replay_Pop to the running means and deviations that scale inputs and targets.
@@ -142,7 +148,7 @@ class DynamicsLearner(FlatLearner):
         """
         batches = by_update(batches, self.num_runs)
         self.check_networks_lie_here()
-        mean = self._updates.mean(self._arrange(self._taken(batches)))
+        mean = self._mean(self._arrange(self._taken(batches)))
         return TensorDict({"loss_dynamics": mean}, mean.shape)
 
     def _taken(self, rows: TensorDictBase) -> TensorDictBase:

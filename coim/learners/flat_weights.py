@@ -8,12 +8,13 @@ Shapes: N weights, K runs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
+from coim.compiling import Compiled
 from coim.learners.captured import FlatUpdates
 
 Precision = Literal["float32", "bfloat16"]
@@ -26,15 +27,16 @@ WAY_OUT = (
 class FlatLearner:
     """Networks whose weights lie in one flat buffer, with Adam over it and a state that can be saved.
 
-    A subclass writes `_update_once`, which computes one update and returns its losses, and calls
-    ``self._updates.mean`` to do many.
+    A subclass writes `_update_once`, which computes one update and returns its losses, and calls `_mean` to do many.
 
     Args:
         networks: by name, in the order in which their weights are laid out; on their device and in their dtype already.
+        gradients: a function of networks and rows, which may be compiled.
         lr: learning rate.
         weight_decay: L2 penalty of Adam.
         num_runs: K when the networks are stacked along the run axis.
         precision: ``"bfloat16"`` has the products read a copy of the weights in bfloat16; the weights stay as they are.
+        compile: compile the gradients in the first update.
 
     Attributes:
         num_runs: K, or None.
@@ -59,11 +61,13 @@ class FlatLearner:
     def __init__(
         self,
         networks: Mapping[str, nn.Module],
+        gradients: Callable[..., Any],
         *,
         lr: float,
         weight_decay: float = 0.0,
         num_runs: int | None,
         precision: Precision,
+        compile: bool,
     ) -> None:
         if precision not in get_args(Precision):
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
@@ -76,6 +80,8 @@ class FlatLearner:
         self._read_weights = in_precision(self._weights.detach(), precision)
         self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
         self.optimiser = self._updates.optimiser
+        self._compiled = Compiled(gradients, self._weights.device) if compile else None
+        self._code, self._checked = gradients, False
 
     def state_dict(self) -> dict[str, Any]:
         """Return what learning has changed, and the shapes of the weights by name. Tensors are not copied."""
@@ -118,6 +124,17 @@ class FlatLearner:
     def _update_once(self, *rows: Tensor) -> Tensor:
         """Write the gradients of one batch to `_gradient`, call ``optimiser.step()`` and return the losses."""
         raise NotImplementedError
+
+    def _mean(self, batches: Iterable[Tensor]) -> Tensor:
+        """Do an update with each batch of tensors ``[U, ...]``, and return the mean of what `_update_once` returns."""
+        self._checked = False
+        return self._updates.mean(batches)
+
+    def _find(self, *inputs: Any, **settings: Any) -> Any:
+        """Call the gradients. Compiled ones look at the first inputs of a `_mean`: all others have the same shapes."""
+        if self._compiled and not self._checked:
+            self._code, self._checked = self._compiled.checked(*inputs, **settings), True
+        return self._code(*inputs, **settings)
 
     def _renew(self) -> None:
         """Copy the weights to where products read them."""

@@ -13,6 +13,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, Literal
 
 import torch
@@ -20,13 +21,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from coim.compiling import compiled
 from coim.learners.flat_weights import FlatLearner, Precision, in_precision, share_storage, views
 from coim.learners.known_networks import check_exchangeable, check_sac_networks
 from coim.learners.rows import check_sac_rows, on_device, sac_batch
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
-from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
+from coim.objectives.gradients import Batch, Network, sac_gradients
 from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
@@ -100,13 +100,16 @@ class SACLearner(FlatLearner):
         self.loss = CoImSACLoss(policy, qvalue, alpha=alpha, gamma=gamma, mix=mix, num_runs=num_runs)
         SoftUpdate(self.loss, tau=tau)  # starts the targets at the critics, and tells TorchRL that they are updated
         networks = {"policy": policy.network.mlp, "qvalue": qvalue.module.mlp}
-        super().__init__(networks, lr=lr, num_runs=num_runs, precision=precision)
+        super().__init__(
+            networks, sac_gradients_in_order, lr=lr, num_runs=num_runs, precision=precision, compile=compile
+        )
         keys = [tuple(name.split(".")) for name, _ in qvalue.named_parameters()]
         self._targets = share_storage([self.loss.target_qvalue_params.get(key) for key in keys])
         self._read_targets = in_precision(self._targets, precision)
-        self._cut_networks(one_by_one=num_runs is None or self._weights.device.type == "cpu")
+        one_by_one = num_runs is None or self._weights.device.type == "cpu"
+        self._flat = compile and one_by_one and num_runs in (None, 1)
+        self._cut_networks(one_by_one=one_by_one)
         self.tau = tau
-        self._find = compiled(sac_gradients, self._weights.device) if compile else sac_gradients
         # A number would become a constant of what is compiled or captured. That reads these, renewed before updates;
         # torch.compile takes a float64 scalar without a dimension for such a number, and fails.
         read = ("alpha", "gamma", "tau") if self._updates.captures else ("alpha", "gamma") if compile else ()
@@ -164,27 +167,24 @@ class SACLearner(FlatLearner):
         noise = self._noise(batches["action"]), self._noise(batches["action"])
         scaling = self.policy.network.scaling
         rows = sac_batch(batches, noise, scaling=scaling, mix=self.loss.mix, num_runs=self.num_runs)
-        means = self._updates.mean(rows)
+        means = self._mean(rows)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
 
     def _update_once(self, *rows: Tensor) -> Tensor:
         """Do one update with the rows of a `Batch`, ``[K, B, ...]``; return losses and entropy, ``[3, K]``."""
         self._renew()
         numbers = self._numbers() | self._read_numbers
-        found = [
-            self._find(
-                *networks,
-                Batch(*(x[run] for x in rows)) if self._one_by_one else Batch(*rows),
-                alpha=numbers["alpha"],
-                gamma=numbers["gamma"],
-                log_scale_range=LOG_SCALE_RANGE,
-            )
-            for run, networks in enumerate(self._networks)
-        ]
-        self._collect(found)
+        settings = {"alpha": numbers["alpha"], "gamma": numbers["gamma"], "log_scale_range": LOG_SCALE_RANGE}
+        settings["flat"] = self._flat
+        losses = []
+        for run, (networks, own) in enumerate(zip(self._networks, self._gradients)):
+            batch = Batch(*(x[run] for x in rows)) if self._one_by_one else Batch(*rows)
+            gradients, found = self._find(*networks, batch, **settings)
+            torch._foreach_copy_(own, gradients)
+            losses.append(found)
         self.optimiser.step()
         self._targets.lerp_(self._weights[-len(self._targets) :], numbers["tau"])
-        return torch.stack([torch.stack([g.loss_actor, g.loss_qvalue, g.entropy]) for g in found], -1).reshape(3, -1)
+        return torch.stack(losses, -1).reshape(3, -1)
 
     def _numbers(self) -> dict[str, Any]:
         return {"alpha": self.loss.alpha, "gamma": self.loss.gamma, "tau": self.tau}
@@ -220,19 +220,43 @@ class SACLearner(FlatLearner):
             for run in runs
         ]
         self._gradients = [
-            ([g[run] for g in gradients["policy"]], [[g[(*run, n)] for g in gradients["qvalue"]] for n in copies])
+            [g[run] for g in gradients["policy"]] + [g[(*run, n)] for n in copies for g in gradients["qvalue"]]
             for run in runs
         ]
+        if self._flat:
+            self._gradients = [[self._gradient]]
 
     def _noise(self, action: Tensor) -> Tensor:
         return torch.randn(action.shape, generator=self.rng, dtype=action.dtype, device=action.device)
 
-    def _collect(self, found: list[SACGradients]) -> None:
-        """Write gradients where Adam reads them."""
-        for (policy, critics), gradients in zip(self._gradients, found):
-            torch._foreach_copy_(policy, gradients.policy)
-            for own, gradient in zip(critics, gradients.critics):
-                torch._foreach_copy_(own, gradient)
+
+def sac_gradients_in_order(
+    policy: Network,
+    critics: Sequence[Network],
+    targets: Sequence[Network],
+    batch: Batch,
+    *,
+    flat: bool,
+    **settings: Any,
+) -> tuple[list[Tensor], Tensor]:
+    """`sac_gradients` as a list; and actor loss, critic loss and entropy, ``[3, (K)]``.
+
+    Args:
+        policy: see `sac_gradients`, as of the next three.
+        critics: likewise.
+        targets: likewise.
+        batch: likewise.
+        flat: for a single run, return one tensor ``[N]`` in the order of its weights. Compiled code then computes each
+            gradient at its place, and hands over one tensor where it had two dozen.
+        settings: of `sac_gradients`.
+    """
+    found = sac_gradients(policy, critics, targets, batch, **settings)
+    losses = torch.stack([found.loss_actor, found.loss_qvalue, found.entropy])
+    if not flat:
+        return [*found.policy, *chain(*found.critics)], losses
+    # Critics are stacked: a layer's weights of all critics lie before the layer's biases of all critics.
+    parts = [*found.policy, *chain(*zip(*found.critics))]
+    return [torch.cat([part.reshape(-1) for part in parts])], losses
 
 
 def _network(layers: Sequence[Tensor], index: Any) -> Network:
