@@ -24,6 +24,8 @@ PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJo
 SHADOWS, SAMPLES = 512, 0
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display, on Linux
+FROM_ABOVE = -25.0  # degrees, elevation of the camera of a robot that does not move in a plane
+ASIDE = 20.0  # degrees by which drawings of lines look along such a robot's way, so that no leg hides another
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
@@ -51,7 +53,7 @@ class Camera:
         self._data = mujoco.MjData(self._model)
         self._view = mujoco.MjvCamera()
         mujoco.mjv_defaultFreeCamera(self._model, self._view)
-        self._view.azimuth, self._view.elevation = 90.0, -8.0 if root.kind == "planar" else -25.0
+        self._view.azimuth, self._view.elevation = 90.0, -8.0 if root.kind == "planar" else FROM_ABOVE
         if name is not None or self._model.ncam:
             self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._view.fixedcamid = _camera_number(self._model, name)
@@ -88,6 +90,23 @@ class Camera:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def drawn_axes(root: Root) -> np.ndarray:
+    """From where a body is drawn by lines: the directions right, up and towards the viewer, ``[3, 3]``.
+
+    A robot that moves in a plane is seen from the side. Any other one is seen from above and behind it, in parallel
+    projection.
+
+    Example:
+        >>> drawn_axes(Root(kind="planar", unseen=1, height=1, quaternion=None, angles=())).tolist()
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+    """
+    if root.kind == "planar":
+        return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    (sin_a, sin_e), (cos_a, cos_e) = (f(np.radians([ASIDE, FROM_ABOVE])) for f in (np.sin, np.cos))
+    right = [cos_a, -sin_a, 0.0]
+    return np.array([right, [-sin_e * sin_a, -sin_e * cos_a, cos_e], [-cos_e * sin_a, -cos_e * cos_a, -sin_e]])
 
 
 def dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:

@@ -316,10 +316,10 @@ class Fleet:
         )
 
     def capsules(self, run: int = 0) -> Tensor:
-        """Return the outline of one row's capsules and spheres from the side, as it stands now.
+        """Return where one row's capsules and spheres are, as it stands now.
 
         Returns:
-            ``[segments, 5]``: x and z of both ends and the radius, in m.
+            ``[segments, 7]``: x, y and z of both ends and the radius, in m; the ends of a sphere are its centre.
         """
         return torch.from_numpy(self.simulations.capsules(run))
 

@@ -120,14 +120,14 @@ class Simulations:
         return lowest_point(model, data)
 
     def capsules(self, row: int) -> np.ndarray:
-        """Return the robot's capsules and spheres as they are seen from the side.
+        """Return where the robot's capsules and spheres are.
 
         Returns:
-            x and z of both ends and the radius in m, ``[segments, 5]``; the ends of a sphere are its centre.
+            Both ends and the radius in m, ``[segments, 7]``; the ends of a sphere are its centre.
         """
         model, data = self._posed(row)
         shown = (model.geom_type == CAPSULE) | (model.geom_type == SPHERE)
-        centre, axis = data.geom_xpos[shown][:, [0, 2]], data.geom_xmat[shown][:, [2, 8]]
+        centre, axis = data.geom_xpos[shown], data.geom_xmat[shown][:, [2, 5, 8]]
         radius, half = model.geom_size[shown, :1], model.geom_size[shown, 1:2]
         return np.hstack([centre - half * axis, centre + half * axis, radius])
 

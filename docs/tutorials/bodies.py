@@ -32,7 +32,7 @@ print(start)
 
 figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 for run, colour in enumerate(("tab:blue", "tab:orange", "tab:green")):
-    for x1, z1, x2, z2, radius in env.capsules(run).tolist():
+    for x1, _, z1, x2, _, z2, radius in env.capsules(run).tolist():
         draw_capsule(axes, (x1 + 1.5 * run, z1), (x2 + 1.5 * run, z2), radius, colour)
 axes.axhline(0, color="black", linewidth=0.8)
 axes.set(aspect="equal", xlabel="m", ylabel="height (m)")

@@ -100,7 +100,7 @@ env.reset(TensorDict({"design": torch.tensor(Crawler.FIRST_DESIGNS)}, [5]))
 
 figure, axes = plt.subplots(figsize=(8, 2.5), layout="constrained")
 for run in range(5):
-    for x1, z1, x2, z2, radius in env.capsules(run).tolist():
+    for x1, _, z1, x2, _, z2, radius in env.capsules(run).tolist():
         draw_capsule(axes, (x1 + 1.6 * run, z1), (x2 + 1.6 * run, z2), radius, "tab:blue")
 axes.axhline(0, color="black", linewidth=0.8)
 axes.set(aspect="equal", xticks=[], ylabel="height (m)")

@@ -6,6 +6,11 @@ import os
 import subprocess
 import sys
 
+import numpy as np
+
+from coim.envs import AntMorph, HopperMorph
+from coim.envs.camera import drawn_axes
+
 PICTURES = """
 import numpy as np, torch
 from tensordict import TensorDict
@@ -80,3 +85,12 @@ def test_a_missing_library_is_said_in_one_sentence_at_import():
     out = subprocess.run([sys.executable, "-c", "import coim"], env=environment, capture_output=True, text=True)
     sentence = "ImportError: MUJOCO_GL=osmesa names an OpenGL library that is missing"
     assert out.returncode == 0 or out.stderr.splitlines()[-1].startswith(sentence)
+
+
+def test_what_is_drawn_by_lines_is_seen_from_the_side_or_from_above_and_behind() -> None:
+    assert drawn_axes(HopperMorph(seed=0).root).tolist() == [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    axes = drawn_axes(AntMorph(seed=0).root)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.cross(axes[0], axes[1]), axes[2], atol=1e-12)  # lengths and sides are not mirrored
+    assert axes[0, 0] > 0.9  # its way goes to the right
+    assert axes[2, 0] < 0 < axes[2, 2]

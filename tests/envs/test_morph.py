@@ -346,9 +346,9 @@ def test_capsules_show_the_body_of_the_row():
     env = HopperMorph(num_runs=2, reset_noise=0)
     reset_to(env, torch.tensor([[1.0] * 4, [2.0] * 4]))
     unit, tall = (env.capsules(run) for run in range(2))
-    assert unit.shape == tall.shape == (4, 5)  # torso, thigh, leg, foot
-    assert unit[:, [1, 3]].max().item() == pytest.approx(1.25 + 0.2)
-    assert tall[:, [1, 3]].max().item() == pytest.approx(2.4 + 0.4)
+    assert unit.shape == tall.shape == (4, 7)  # torso, thigh, leg, foot
+    assert unit[:, [2, 5]].max().item() == pytest.approx(1.25 + 0.2)
+    assert tall[:, [2, 5]].max().item() == pytest.approx(2.4 + 0.4)
 
 
 # ---- bad input ----

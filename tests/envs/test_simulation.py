@@ -93,11 +93,11 @@ def test_the_users_own_logging_is_as_it_was():
     assert (after.logto_file, after.logto_console) == (before.logto_file, before.logto_console)
 
 
-def test_capsules_are_the_outline_of_the_body_as_it_stands():
+def test_capsules_are_where_the_body_is_as_it_stands():
     simulations = fleet(num=1)  # 1 m long, radius 0.05 m, hanging at 2 m
     simulations.qpos[0] = np.pi / 2  # swung up to the side of -x
     ends = simulations.capsules(0)
-    np.testing.assert_allclose(ends, [[-1, 2, 0, 2, 0.05]], atol=1e-12)
+    np.testing.assert_allclose(ends, [[-1, 0, 2, 0, 0, 2, 0.05]], atol=1e-12)
 
 
 def test_lifting_moves_a_body_out_of_the_floor_and_leaves_others_alone():

@@ -134,7 +134,7 @@ def test_the_crawler_is_what_its_table_says() -> None:
     heights = 0.5 * designs[:, 1:].amax(1) + 0.05  # of the torso above the floor, m
     torch.testing.assert_close(start["observation"][:, 0], heights)
     torch.testing.assert_close(env.clearance(start["observation"], designs), torch.zeros(3, 1), rtol=0, atol=1e-6)
-    lengths = [(part[:2] - part[2:4]).norm().item() for part in env.capsules(2)]
+    lengths = [(part[:3] - part[3:6]).norm().item() for part in env.capsules(2)]
     assert lengths == pytest.approx([1.5 * 0.8, 0.8 * 0.5, 1.2 * 0.5])
     assert env.step_seconds == pytest.approx(0.02)
     faster = torch.zeros(9)

@@ -87,11 +87,13 @@ function chooseRun(run) {
   find("policy").replaceChildren(...names.map((name) => new Option(name, name)));
   if (names.length) find("policy").value = names.at(-1);
   find("policies").hidden = !(names.length && shown.mujoco !== null);
-  const tallest = Math.max(...run.bodies.flatMap(({ outline }) => outline.flatMap(([, z1, , z2, r]) => [z1 + r, z2 + r])));
+  const extents = run.bodies.map(({ outline }) => extent(seen(outline, page.body.axes)));
+  const tallest = Math.max(...extents.map(([low, high]) => high - low));
+  run.extent = [Math.min(...extents.map(([low]) => low)), Math.max(...extents.map(([, high]) => high))];
   find("bodies").replaceChildren(...run.bodies.map((body) => {
     const button = Object.assign(document.createElement("button"), { type: "button", title: inWords(body) });
     button.dataset.number = body.number;
-    button.append(drawOutline(body, 88 / tallest, tallest), `${body.number}`, document.createElement("br"), `${Math.round(body.best)}`);
+    button.append(drawOutline(body, page.body.axes, 88 / tallest, tallest), `${body.number}`, document.createElement("br"), `${Math.round(body.best)}`);
     button.addEventListener("click", () => choose(body));
     return button;
   }));
@@ -106,7 +108,7 @@ function drawCharts() {
   if (page.runs.length > 1) drawBest(find("best"), page.runs, page.body, shown.run);
 }
 
-// The robot from the side, above a floor with a mark at each metre.
+// The robot, followed on its way: from the side above a floor with a mark at each metre, or on a floor of squares of 1 m.
 function draw() {
   const canvas = find("stage"), ratio = window.devicePixelRatio || 1;
   const width = canvas.clientWidth, height = canvas.clientHeight;
@@ -115,34 +117,75 @@ function draw() {
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, width, height);
   if (shown.walker === null) return;
-  const capsules = shown.walker.capsules();
-  const tall = 1.15 * Math.max(1, ...shown.run.bodies.flatMap(({ outline }) => outline.flatMap(([, z1, , z2, r]) => [z1 + r, z2 + r])));
-  const metre = (height - 40) / tall, floor = height - 28;
-  const middle = (capsules[0][0] + capsules[0][2]) / 2;
+  const capsules = shown.walker.capsules(), [x1, y1, , x2, y2] = capsules[0];
+  const place = [(x1 + x2) / 2, (y1 + y2) / 2];
+  context.font = "12px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.lineCap = "round";
+  const { axes } = page.body, flat = axes[2][2] === 0;
+  (flat ? drawFromTheSide : drawFromAbove)(context, { width, height, capsules: seen(capsules, axes), place, axes });
+  const time = shown.walker.steps * shown.walker.seconds;
+  find("place").textContent = `${place[0].toFixed(1)} m in ${time.toFixed(1)} s`;
+}
+
+function drawFromTheSide(context, { width, height, capsules, place }) {
+  const tall = 1.15 * Math.max(1, shown.run.extent[1]);
+  const metre = (height - 40) / tall, floor = height - 28, [middle] = place;
   const across = (x) => width / 2 + (x - middle) * metre;
   context.fillStyle = colour("faint");
   context.fillRect(0, floor, width, height - floor);
-  context.strokeStyle = context.fillStyle = colour("soft");
-  context.font = "12px system-ui, sans-serif";
-  context.textAlign = "center";
+  context.fillStyle = colour("soft");
   const reach = width / 2 / metre;
   for (let x = Math.ceil(middle - reach); x <= middle + reach; x++) {
     context.fillRect(across(x), floor, 1, 6);
     context.fillText(`${x} m`, across(x), height - 6);
   }
-  context.lineCap = "round";
-  for (const [outer, name] of [[1.5, "text"], [0, "robot"]]) {
-    context.strokeStyle = colour(name);
-    for (const [x1, z1, x2, z2, radius] of capsules) {
-      context.lineWidth = 2 * (radius * metre + outer);
-      context.beginPath();
-      context.moveTo(across(x1), floor - z1 * metre);
-      context.lineTo(across(x2) + (x1 === x2 && z1 === z2 ? 0.01 : 0), floor - z2 * metre);
-      context.stroke();
-    }
+  for (const part of [outlined, filledIn]) for (const capsule of capsules) part(context, capsule, across, (z) => floor - z * metre, metre);
+}
+
+function drawFromAbove(context, { width, height, capsules, place, axes }) {
+  const [low, high] = shown.run.extent, metre = height / Math.max(1.5, 2.2 * (high - low));
+  const onFloor = (x, y) => [0, 1].map((axis) => axes[axis][0] * x + axes[axis][1] * y);
+  const [right, up] = onFloor(...place), level = height / 2 + ((low + high) / 2) * metre;
+  const across = (u) => width / 2 + (u - right) * metre, down = (v) => level - (v - up) * metre;
+  const reach = Math.ceil((2 * Math.hypot(width, height)) / metre), [x0, y0] = place.map(Math.round);
+  const line = (from, to) => {
+    context.moveTo(across(from[0]), down(from[1]));
+    context.lineTo(across(to[0]), down(to[1]));
+  };
+  context.strokeStyle = colour("faint");
+  context.lineWidth = 1.5;
+  context.beginPath();
+  for (let k = -reach; k <= reach; k++) {
+    line(onFloor(x0 + k, y0 - reach), onFloor(x0 + k, y0 + reach));
+    line(onFloor(x0 - reach, y0 + k), onFloor(x0 + reach, y0 + k));
   }
-  const time = shown.walker.steps * shown.walker.seconds;
-  find("place").textContent = `${middle.toFixed(1)} m in ${time.toFixed(1)} s`;
+  context.stroke();
+  context.fillStyle = colour("soft");
+  const lane = y0 - 1; // a line of squares before the robot
+  for (let x = x0 - reach; x <= x0 + reach; x++) {
+    const [u, v] = onFloor(x, lane);
+    context.fillText(`${x} m`, across(u), down(v) + 4);
+  }
+  // The farthest first, each with an edge of its own: so one sees which leg is before the other.
+  for (const capsule of capsules) for (const part of [outlined, filledIn]) part(context, capsule, across, down, metre);
+}
+
+function outlined(context, capsule, across, down, metre) {
+  drawCapsule(context, capsule, across, down, metre, 1.5, "text");
+}
+
+function filledIn(context, capsule, across, down, metre) {
+  drawCapsule(context, capsule, across, down, metre, 0, "robot");
+}
+
+function drawCapsule(context, [u1, v1, u2, v2, radius], across, down, metre, outer, name) {
+  context.strokeStyle = colour(name);
+  context.lineWidth = 2 * (radius * metre + outer);
+  context.beginPath();
+  context.moveTo(across(u1), down(v1));
+  context.lineTo(across(u2) + (u1 === u2 && v1 === v2 ? 0.01 : 0), down(v2));
+  context.stroke();
 }
 
 function tick(now) {

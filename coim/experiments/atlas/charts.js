@@ -140,14 +140,32 @@ function drawBest(place, runs, body, chosen) {
   drawn.svg.setAttribute("aria-label", "Lengths of the best body of each run.");
 }
 
-// A body at rest; `metre` is in pixels, the floor is the lower edge.
-function drawOutline(body, metre, tallest) {
-  const xs = body.outline.flatMap(([x1, , x2, , r]) => [x1 - r, x1 + r, x2 - r, x2 + r]);
+// Capsules in a parallel projection, the farthest first: right and up of both ends and the radius, in m.
+function seen(capsules, axes) {
+  const along = (axis, point) => axis.reduce((sum, share, i) => sum + share * point[i], 0);
+  const found = capsules.map((capsule) => {
+    const [start, end] = [capsule.slice(0, 3), capsule.slice(3, 6)].map((point) => axes.map((axis) => along(axis, point)));
+    return { near: start[2] + end[2], flat: [start[0], start[1], end[0], end[1], capsule[6]] };
+  });
+  return found.sort((a, b) => a.near - b.near).map(({ flat }) => flat);
+}
+
+// Lowest and highest point of capsules that are seen, in m; the floor at least.
+function extent(capsules) {
+  const ends = capsules.flatMap(([, low, , high, r]) => [low - r, low + r, high - r, high + r]);
+  return [Math.min(0, ...ends), Math.max(...ends)];
+}
+
+// A body at rest; `metre` is in pixels, the floor is the lower edge, or where the nearest foot stands.
+function drawOutline(body, axes, metre, tallest) {
+  const capsules = seen(body.outline, axes), [low] = extent(capsules);
+  const xs = capsules.flatMap(([x1, , x2, , r]) => [x1 - r, x1 + r, x2 - r, x2 + r]);
   const left = Math.min(...xs), width = (Math.max(...xs) - left) * metre + 4, height = tallest * metre + 4;
   const svg = make("svg", { width, height, viewBox: `0 0 ${width} ${height}`, class: `kind-${body.kind}`, "aria-hidden": "true" });
-  for (const [x1, z1, x2, z2, r] of body.outline) {
+  for (const [x1, z1, x2, z2, r] of capsules) {
     const [from, to] = [x1 - left, x2 - left].map((x) => x * metre + 2);
-    const ends = { x1: from, x2: to + (x1 === x2 && z1 === z2 ? 0.01 : 0), y1: height - 2 - z1 * metre, y2: height - 2 - z2 * metre };
+    const [y1, y2] = [z1, z2].map((z) => height - 2 - (z - low) * metre);
+    const ends = { x1: from, x2: to + (x1 === x2 && z1 === z2 ? 0.01 : 0), y1, y2 };
     svg.append(make("line", { ...ends, "stroke-width": 2 * r * metre, "stroke-linecap": "round", class: "limb" }));
   }
   return svg;

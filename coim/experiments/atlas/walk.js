@@ -1,5 +1,5 @@
 "use strict";
-// Policies, bodies and walks. Positions in m; a capsule is [x1, z1, x2, z2, radius], seen from the side.
+// Policies, bodies and walks. Positions in m; a capsule is [x1, y1, z1, x2, y2, z2, radius].
 
 const TURN = 2 * Math.PI;
 const BEYOND_PHYSICS = 1e6; // as coim.envs.simulation: a simulation with such a number is broken
@@ -144,9 +144,9 @@ class Simulation {
   capsules() {
     const { geom_size: size } = this.model, { geom_xpos: place, geom_xmat: turn } = this.data;
     return this.shown.map((i) => {
-      const [x, z, half] = [place[3 * i], place[3 * i + 2], this.model.geom_type[i] === CAPSULE ? size[3 * i + 1] : 0];
-      const [dx, dz] = [half * turn[9 * i + 2], half * turn[9 * i + 8]];
-      return [x - dx, z - dz, x + dx, z + dz, size[3 * i]];
+      const half = this.model.geom_type[i] === CAPSULE ? size[3 * i + 1] : 0;
+      const end = (sign) => [0, 1, 2].map((axis) => place[3 * i + axis] + sign * half * turn[9 * i + 3 * axis + 2]);
+      return [...end(-1), ...end(1), size[3 * i]];
     });
   }
 }
@@ -167,10 +167,10 @@ class Recording {
   }
 
   capsules() {
-    const size = 4 * this.outline.length;
+    const size = 6 * this.outline.length;
     return this.outline.map((capsule, i) => {
-      const at = this.steps * size + 4 * i;
-      return [...this.frames.subarray(at, at + 4), capsule[4]];
+      const at = this.steps * size + 6 * i;
+      return [...this.frames.subarray(at, at + 6), capsule[6]];
     });
   }
 }

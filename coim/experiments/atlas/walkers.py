@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from coim.envs import MorphEnv
+from coim.envs.camera import drawn_axes
 from coim.envs.root import FREE
 from coim.envs.written_body import WrittenBody, written_body
 from coim.models import Policy
@@ -57,6 +58,7 @@ def body_table(bodies: MorphEnv) -> dict[str, Any]:
         "step_seconds": bodies.step_seconds,
         "first_position": bodies.simulations.qpos.shape[1] - _num_positions(bodies),
         "height": bodies.root.height,
+        "axes": drawn_axes(bodies.root).tolist(),
         "angles": list(bodies.angle_indices),
         "ranges": _ranges(bodies),
         "names": list(bodies.design_names()),
@@ -93,7 +95,7 @@ def policy_table(policy: Policy) -> dict[str, Any]:
 
 
 def outlines(body: type[MorphEnv], designs: np.ndarray) -> list[list[list[float]]]:
-    """Capsules of bodies at rest, from the side, in m: x and z of both ends and the radius, ``[N, G, 5]``.
+    """Capsules of bodies at rest: x, y and z of both ends and the radius in m, ``[N, G, 7]``.
 
     Args:
         body: the environment that the designs belong to.
@@ -109,7 +111,7 @@ class Walk:
     """The first seconds of an episode.
 
     Attributes:
-        frames: x and z of both ends of each capsule in m, at 30 frames a second, ``[T, G, 4]``.
+        frames: x, y and z of both ends of each capsule in m, at 30 frames a second, ``[T, G, 6]``.
         observation: states visited on the way, ``[n, S]``.
         design: ``[D]``.
     """
@@ -140,7 +142,7 @@ def record_walk(bodies: MorphEnv, policy: Policy, design: Tensor, *, seconds: fl
     frames, seen = [], []
     for step in range(steps):
         if step % stride == 0:
-            frames.append(bodies.capsules()[:, :4].numpy())
+            frames.append(bodies.capsules()[:, :6].numpy())
         seen.append(observation)
         observation, _ = bodies.move(policy.deterministic_action(observation, given))
     chosen = np.linspace(0, steps - 1, min(steps, STATES)).astype(int)

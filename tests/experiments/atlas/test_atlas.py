@@ -80,10 +80,10 @@ def test_a_recorded_walk_is_the_episode(folder: Path) -> None:
     saved = load_run(folder, run=0)
     design = torch.tensor([1.0, 1.2, 1.0, 1.0])
     walk = walkers.record_walk(saved.bodies, saved.population.policy, design)
-    assert walk.frames.shape == (15, 4, 4)  # 60 steps of 8 ms at 30 frames a second
+    assert walk.frames.shape == (15, 4, 6)  # 60 steps of 8 ms at 30 frames a second
     assert walk.observation.shape == (60, 11)
     torso = walk.frames[:, 0]  # its centre's height is the first entry of the observation
-    np.testing.assert_allclose(torso[:, [1, 3]].mean(1), walk.observation[::4, 0], atol=1e-6)
+    np.testing.assert_allclose(torso[:, [2, 5]].mean(1), walk.observation[::4, 0], atol=1e-6)
 
 
 def test_several_runs_are_compared_also_without_networks(tmp_path: Path) -> None:

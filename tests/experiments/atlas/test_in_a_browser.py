@@ -20,8 +20,10 @@ from tiny_runs import run
 
 from coim import load_run
 from coim.envs import AntMorph, HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
+from coim.envs.camera import drawn_axes
 from coim.experiments.atlas.walkers import body_table
 from coim.experiments.commands.atlas import main
+from coim.experiments.drawing.bodies import seen
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: it drives the browser")
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -98,6 +100,39 @@ def walking(browser: Any, folder: Path) -> Any:
     browser.get((folder / "simulated.html").as_uri())
     until(browser, "shown.walker instanceof Simulation && shown.walker.steps > 20")
     return browser
+
+
+@pytest.mark.parametrize("body", [WalkerMorph, AntMorph])
+def test_the_page_draws_what_the_figures_draw(browser: Any, folder: Path, body: type[MorphEnv]) -> None:
+    main([str(folder)])
+    browser.get((folder / "atlas.html").as_uri())
+    env = body(seed=0)
+    env.rollout(10)
+    axes = drawn_axes(env.root)
+    found = browser.execute_script("return seen(arguments[0], arguments[1]);", env.capsules().tolist(), axes.tolist())
+    np.testing.assert_allclose(found, seen(env.capsules().numpy(), axes), rtol=0, atol=1e-12)
+
+
+@simulated
+def test_an_ant_stands_on_a_floor_of_squares(walking: Any) -> None:
+    env = AntMorph(seed=0)
+    painted = walking.execute_script(
+        "const robot = new Simulation(shown.mujoco, arguments[0], { act: () => [] }, arguments[1]);"
+        "const before = [shown.walker, page.body, shown.run.extent];"
+        "Object.assign(shown, { walker: robot, playing: false });"
+        "page.body = arguments[0];"
+        "shown.run.extent = extent(seen(robot.capsules(), page.body.axes));"
+        "draw();"
+        "[shown.walker, page.body, shown.run.extent] = before;"
+        "shown.playing = true;"
+        "const canvas = find('stage');"
+        "const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);"
+        "return pixels.data.filter((value, i) => i % 4 === 3 && value > 0).length / (canvas.width * canvas.height);",
+        body_table(env),
+        [1.0] * 8,
+    )
+    assert 0.05 < painted < 0.5
+    assert complaints(walking) == []
 
 
 @simulated
