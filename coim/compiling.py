@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten
 
-from coim.kept_code import keep, kept
+from coim.kept_code import fingerprint, keep, kept
 from coim.products import Choice, chosen
 
 P = ParamSpec("P")
@@ -61,6 +61,10 @@ class Compiled(Generic[P, R]):
         self._function, self._device = function, device
         self._code: dict[Choice, Any] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy compiles anew, or finds the code: that itself cannot be copied."""
+        return self.__dict__ | {"_code": {}}
+
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         return self._code_for(args, kwargs)(*args, **kwargs)
 
@@ -91,16 +95,17 @@ def _code_for(function: Callable[..., Any], device: torch.device, args: tuple[An
     name = f"{function.__module__}.{function.__qualname__}"
     if getattr(sys.modules.get(function.__module__), function.__qualname__, None) is not function:
         return _compile(function, device, args, kwargs)  # a local function: its name does not say what it does
-    key = (name, device.type, chosen(), torch.get_num_threads(), described(args, kwargs))
-    if key not in _MADE:
-        # A card's code was never tried in another process.
-        code = kept(function, key, args, kwargs) if device.type == "cpu" else None
-        if code is None:
-            code = _compile(function, device, args, kwargs)
-            if device.type == "cpu":
-                keep(code, function, key)
-        _MADE[key] = code
-    return _MADE[key]
+    key = (name, fingerprint(function), device.type, chosen(), torch.get_num_threads(), described(args, kwargs))
+    code = _MADE.get(key)
+    if code is None and device.type == "cpu":  # a card's code was never tried in another process
+        code = kept(function, key, args, kwargs)
+    # Guards know of states of torch that the key does not, such as autocast.
+    if code is None or not code.guard_check(*args, **kwargs):
+        code = _compile(function, device, args, kwargs)
+        if device.type == "cpu":
+            keep(code, function, key)
+    _MADE[key] = code
+    return code
 
 
 def _compile(function: Callable[..., Any], device: torch.device, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

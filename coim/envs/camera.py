@@ -25,7 +25,7 @@ SHADOWS, SAMPLES = 512, 0
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display, on Linux
 FROM_ABOVE = -25.0  # degrees, elevation of the camera of a robot that does not move in a plane
-ASIDE = 20.0  # degrees by which drawings of lines look along such a robot's way, so that no leg hides another
+ASIDE = 20.0  # degrees by which drawings of lines look along the way of a free robot, so that no leg hides another
 MISSING_GL = (
     "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
     "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
@@ -95,14 +95,14 @@ class Camera:
 def drawn_axes(root: Root) -> np.ndarray:
     """From where a body is drawn by lines: the directions right, up and towards the viewer, ``[3, 3]``.
 
-    A robot that moves in a plane is seen from the side. Any other one is seen from above and behind it, in parallel
-    projection.
+    A robot with a free root is seen from the side, a little from above and behind, in parallel projection; any other
+    one from the side alone.
 
     Example:
         >>> drawn_axes(Root(kind="planar", unseen=1, height=1, quaternion=None, angles=())).tolist()
         [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
     """
-    if root.kind == "planar":
+    if root.kind != "free":
         return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     (sin_a, sin_e), (cos_a, cos_e) = (f(np.radians([ASIDE, FROM_ABOVE])) for f in (np.sin, np.cos))
     right = [cos_a, -sin_a, 0.0]

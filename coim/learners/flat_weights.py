@@ -81,7 +81,8 @@ class FlatLearner:
         self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
         self.optimiser = self._updates.optimiser
         self._compiled = Compiled(gradients, self._weights.device) if compile else None
-        self._code, self._checked = gradients, False
+        self._plain: Callable[..., Any] = gradients
+        self._code: Callable[..., Any] | None = None  # while updates are done
 
     def state_dict(self) -> dict[str, Any]:
         """Return what learning has changed, and the shapes of the weights by name. Tensors are not copied."""
@@ -127,13 +128,15 @@ class FlatLearner:
 
     def _mean(self, batches: Iterable[Tensor]) -> Tensor:
         """Do an update with each batch of tensors ``[U, ...]``, and return the mean of what `_update_once` returns."""
-        self._checked = False
-        return self._updates.mean(batches)
+        try:
+            return self._updates.mean(batches)
+        finally:
+            self._code = None
 
     def _find(self, *inputs: Any, **settings: Any) -> Any:
         """Call the gradients. Compiled ones look at the first inputs of a `_mean`: all others have the same shapes."""
-        if self._compiled and not self._checked:
-            self._code, self._checked = self._compiled.checked(*inputs, **settings), True
+        if self._code is None:
+            self._code = self._compiled.checked(*inputs, **settings) if self._compiled else self._plain
         return self._code(*inputs, **settings)
 
     def _renew(self) -> None:

@@ -87,7 +87,7 @@ def test_a_missing_library_is_said_in_one_sentence_at_import():
     assert out.returncode == 0 or out.stderr.splitlines()[-1].startswith(sentence)
 
 
-def test_what_is_drawn_by_lines_is_seen_from_the_side_or_from_above_and_behind() -> None:
+def test_what_is_drawn_by_lines_is_seen_from_the_side_or_a_little_from_above_and_behind() -> None:
     assert drawn_axes(HopperMorph(seed=0).root).tolist() == [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     axes = drawn_axes(AntMorph(seed=0).root)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)

@@ -24,7 +24,7 @@ BODIES_IN_A_LINE = 8
 def draw_bodies(axes: Axes, rows: pd.DataFrame, body: type[MorphEnv]) -> None:
     """Draw designs from left to right on one floor, each above its number and its best return.
 
-    Robots that do not move in a plane are seen from above and behind, without a floor.
+    Robots with a free root are seen a little from above and behind, without a floor.
 
     Args:
         axes: axes to draw on.
@@ -33,7 +33,7 @@ def draw_bodies(axes: Axes, rows: pd.DataFrame, body: type[MorphEnv]) -> None:
     """
     env = body(num_runs=len(rows), reset_noise=0, seed=0)
     env.reset(TensorDict({"design": torch.tensor(designs_of(rows), dtype=torch.float32)}, [len(rows)]))
-    from_the_side = env.root.kind == "planar"
+    from_the_side = env.root.kind != "free"
     left = 0.0
     for run, row in enumerate(rows_of(rows)):
         capsules = seen(env.capsules(run).numpy(), drawn_axes(env.root))

@@ -113,26 +113,26 @@ def test_the_page_draws_what_the_figures_draw(browser: Any, folder: Path, body: 
     np.testing.assert_allclose(found, seen(env.capsules().numpy(), axes), rtol=0, atol=1e-12)
 
 
-@simulated
-def test_an_ant_stands_on_a_floor_of_squares(walking: Any) -> None:
+def test_an_ant_stands_on_a_floor_of_squares(browser: Any, folder: Path) -> None:
+    main([str(folder)])
+    browser.get((folder / "atlas.html").as_uri())
+    until(browser, "shown.walker instanceof Recording")
     env = AntMorph(seed=0)
-    painted = walking.execute_script(
-        "const robot = new Simulation(shown.mujoco, arguments[0], { act: () => [] }, arguments[1]);"
-        "const before = [shown.walker, page.body, shown.run.extent];"
-        "Object.assign(shown, { walker: robot, playing: false });"
-        "page.body = arguments[0];"
-        "shown.run.extent = extent(seen(robot.capsules(), page.body.axes));"
+    env.reset()
+    painted = browser.execute_script(
+        "page.body.axes = arguments[0];"
+        "shown.playing = false;"
+        "shown.walker = { capsules: () => arguments[1], steps: 0, seconds: 0.05 };"
+        "shown.run.extent = extent(seen(arguments[1], arguments[0]));"
         "draw();"
-        "[shown.walker, page.body, shown.run.extent] = before;"
-        "shown.playing = true;"
         "const canvas = find('stage');"
         "const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);"
         "return pixels.data.filter((value, i) => i % 4 === 3 && value > 0).length / (canvas.width * canvas.height);",
-        body_table(env),
-        [1.0] * 8,
+        drawn_axes(env.root).tolist(),
+        env.capsules().tolist(),
     )
     assert 0.05 < painted < 0.5
-    assert complaints(walking) == []
+    assert complaints(browser) == []
 
 
 @simulated
