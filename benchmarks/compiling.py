@@ -26,23 +26,20 @@ def compiling(effort: Effort) -> list[Figure]:
             for seconds in (cold, warm):
                 (figure,) = in_fresh_process(measure, effort, cores=1)
                 seconds += figure.amounts
+    rows = (
+        ("nothing compiled yet", "a later process", cold, warm, 20),
+        ("in a later process", "the first one", warm, cold, 3),
+    )
     return [
         Figure(
-            row=ROW.format("nothing compiled yet"),
-            against="a later process",
-            ratios=over(cold, warm),
-            amounts=tuple(cold),
+            row=ROW.format(when),
+            against=against,
+            ratios=over(seconds, others),
+            amounts=tuple(seconds),
             unit="s",
-            target=Target(20, of="amount"),
-        ),
-        Figure(
-            row=ROW.format("in a later process"),
-            against="the first process",
-            ratios=over(warm, cold),
-            amounts=tuple(warm),
-            unit="s",
-            target=Target(3, of="amount"),
-        ),
+            target=Target(limit, of="amount"),
+        )
+        for when, against, seconds, others, limit in rows
     ]
 
 

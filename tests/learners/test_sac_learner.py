@@ -47,6 +47,17 @@ def test_updates_equal_the_loss_adam_and_soft_update(make_rows: Rows, mix: str, 
         torch.testing.assert_close(learner.loss.state_dict()[key], value, rtol=0, atol=1e-9)
 
 
+def test_compiled_updates_refuse_batches_of_another_size_also_after_others(make_rows: Rows) -> None:
+    learner = sac_learner(compile=True)
+    learner.update(make_rows(2, 32))
+    learner.update(make_rows(2, 32))
+    before = weights(learner)
+    with pytest.raises(RuntimeError, match="expected 32, actual 31"):
+        learner.update(make_rows(2, 31))
+    assert all(torch.equal(value, before[key]) for key, value in weights(learner).items())
+    learner.update(make_rows(2, 32))
+
+
 def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(make_rows: Rows) -> None:
     fleet = sac_learner(3)
     alone = [

@@ -5,6 +5,7 @@ const page = JSON.parse(document.getElementById("data").textContent);
 const find = (name) => document.getElementById(name);
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const LONGEST_LAG = 0.1; // s of the clock that are caught up with, so that a hidden page does not race afterwards
+const EDGE = { outer: 1.5, name: "text" }, INSIDE = { outer: 0, name: "robot" }; // a capsule is painted twice; `outer` in pixels
 
 const shown = { run: page.runs[0], body: null, mujoco: null, walker: null, playing: true, last: null, due: 0, failure: "" };
 const sliders = page.body.names.map((name, i) => {
@@ -140,7 +141,8 @@ function drawFromTheSide(context, { width, height, capsules, place }) {
     context.fillRect(across(x), floor, 1, 6);
     context.fillText(`${x} m`, across(x), height - 6);
   }
-  for (const part of [outlined, filledIn]) for (const capsule of capsules) part(context, capsule, across, (z) => floor - z * metre, metre);
+  const down = (z) => floor - z * metre;
+  for (const paint of [EDGE, INSIDE]) for (const capsule of capsules) drawCapsule(context, capsule, across, down, metre, paint);
 }
 
 function drawFromAbove(context, { width, height, capsules, place, axes }) {
@@ -168,18 +170,10 @@ function drawFromAbove(context, { width, height, capsules, place, axes }) {
     context.fillText(`${x} m`, across(u), down(v) + 4);
   }
   // The farthest first, each with an edge of its own: so one sees which leg is before the other.
-  for (const capsule of capsules) for (const part of [outlined, filledIn]) part(context, capsule, across, down, metre);
+  for (const capsule of capsules) for (const paint of [EDGE, INSIDE]) drawCapsule(context, capsule, across, down, metre, paint);
 }
 
-function outlined(context, capsule, across, down, metre) {
-  drawCapsule(context, capsule, across, down, metre, 1.5, "text");
-}
-
-function filledIn(context, capsule, across, down, metre) {
-  drawCapsule(context, capsule, across, down, metre, 0, "robot");
-}
-
-function drawCapsule(context, [u1, v1, u2, v2, radius], across, down, metre, outer, name) {
+function drawCapsule(context, [u1, v1, u2, v2, radius], across, down, metre, { outer, name }) {
   context.strokeStyle = colour(name);
   context.lineWidth = 2 * (radius * metre + outer);
   context.beginPath();
