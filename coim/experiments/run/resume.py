@@ -10,6 +10,7 @@ from typing import Any
 
 from coim.checkpoints import PREFIX
 from coim.experiments.run.atomic_write import ASIDE, write_whole
+from coim.experiments.run.effect import without_effect
 from coim.experiments.run.interrupt import LOCK
 from coim.experiments.run.machine import choose_products
 from coim.experiments.run.provenance import git_revision, now, versions
@@ -153,6 +154,8 @@ def still_finished(settings: Settings, folder: Path) -> bool:
     saved, asked = read_config(folder)["settings"], json.loads(json.dumps(plain(settings)))
     more = asked["num_designs"] > saved["num_designs"]
     fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})
+    # A protocol may have changed in what this arm does not read: the size of a model that a model-free run has not.
+    fixed -= without_effect(settings).keys()
     if other := [name for name in sorted(fixed) if saved[name] != asked[name]]:
         told = ", ".join(f"{name} ({saved[name]!r} to {asked[name]!r})" for name in other)
         raise ValueError(
@@ -190,7 +193,8 @@ def refuse_changes(old: Settings, new: Settings) -> None:
     Raises:
         ValueError: with their names, old and new values, and the settings that may change.
     """
-    fixed = {name: values for name, values in changes(old, new).items() if name not in {*FREE, *ELSEWHERE}}
+    idle = without_effect(old).keys() & without_effect(new).keys()
+    fixed = {name: values for name, values in changes(old, new).items() if name not in {*FREE, *ELSEWHERE, *idle}}
     if fixed:
         told = ", ".join(f"{name} ({was!r} to {wanted!r})" for name, (was, wanted) in fixed.items())
         raise ValueError(

@@ -221,6 +221,18 @@ def test_a_finished_cell_of_another_protocol_is_not_compared_with_what_is_comput
 
 
 @pytest.mark.parametrize("begun", ["finished", "waiting"])
+def test_a_cell_goes_on_where_the_protocol_changed_in_what_its_arm_does_not_read(tmp_path: Path, begun: State) -> None:
+    none, known = finished_study(tmp_path).cells()
+    ledger = Ledger(tmp_path / "ledger.csv", [none, known])
+    for cell in (none, known):
+        ledger.note(cell.name, begun, tries=1)
+    changed = study(seeds=(3,), overrides={"model_cells": (4, 4)}).cells()
+    with pytest.raises(ValueError, match=rf"{known.name} .*other settings: model_cells"):
+        take_up(tmp_path, changed, Resources())
+    assert take_up(tmp_path, [changed[0], known], Resources()).in_state(begun) == [none.name, known.name]
+
+
+@pytest.mark.parametrize("begun", ["finished", "waiting"])
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
