@@ -23,6 +23,7 @@ from coim.agreement import check_bodies, check_buffers, check_counts, check_kind
 from coim.buffers import Buffers
 from coim.design_choice import DesignChoice, Situation
 from coim.envs.morph import MorphEnv
+from coim.envs.native_episode import library
 from coim.episode import run_episode
 from coim.events import EpisodeDone, Event
 from coim.imagined_replay import ImaginedReplay
@@ -53,13 +54,14 @@ class CoAdaptation:
         updates: how many updates follow an episode, and the rows of their batches; None is the paper's.
         side_by_side: train the individual learner in one thread while another trains the population's and the ensemble.
             They do not depend on each other, and the result is the same to the last bit. For learners on the CPU.
+        native_episodes: let the bodies act in native code, see `coim.run_episode`.
         seed: seeds actions, imagination and batches. Actions are drawn on the CPU wherever the networks are: there the
             same seed gives the same first episode.
 
     Raises:
         ValueError: if a count or a share is out of its range, or the parts do not agree; see `coim.agreement`.
         TypeError: if an environment or the dream is behind transforms, or a part is no such thing at all.
-        RuntimeError: if networks were moved after their learner was made.
+        RuntimeError: if networks were moved after their learner was made, or native code cannot be compiled.
 
     Note:
         After a caller has stopped at an event, iterating again goes on with what comes next, and so does another
@@ -85,6 +87,7 @@ class CoAdaptation:
         episodes: int = 100,
         updates: UpdatePlan | None = None,
         side_by_side: bool = False,
+        native_episodes: bool = False,
         seed: int = 0,
     ) -> None:
         check_counts({"num_designs": num_designs, "first_episodes": first_episodes, "episodes": episodes}, {})
@@ -120,6 +123,9 @@ class CoAdaptation:
         if imagined is not None and imagined.governor is not None:
             devices |= dict.fromkeys(GOVERNED, buffers.pop.storage.device)
         self.rngs = {name: stream(name, seed, device) for name, device in devices.items()}
+        self.native_episodes = native_episodes
+        if native_episodes:
+            library()  # what cannot be compiled is said now, and not after the first body is chosen
         self.training = Training(plan, buffers, learners, self.rngs, imagined=imagined, side_by_side=side_by_side)
         self.divergence = Divergence(env.batch_size.numel(), [*learners.values()])
         self.position = Position()
@@ -166,7 +172,7 @@ class CoAdaptation:
         with booked(seconds, "episode"):
             # Collect experience for the current design with pi_Ind.
             with booked(seconds, "collect"):
-                rows = run_episode(self.env, self.individual.policy, design=design, rng=self.rngs["actions"])
+                rows = self._episode(self.env, design, rng=self.rngs["actions"])
                 self.buffers.ind.extend(rows)
                 self.buffers.pop.extend(rows)
             # Refresh Replay_Art with p~ and pi_Pop; stale rows would come from an older policy and model.
@@ -178,7 +184,7 @@ class CoAdaptation:
             metrics |= self.training.after_episode(seconds)
             self.divergence.contain(metrics, place)
             with booked(seconds, "evaluate"):
-                evaluation = run_episode(self.evaluation_env, self.individual.policy, design=design, deterministic=True)
+                evaluation = self._episode(self.evaluation_env, design, deterministic=True)
         self.position.env_steps += len(rows)
         broken = [found["next", "terminated"].sum(0).squeeze(-1).cpu().float() for found in (rows, evaluation)]
         metrics["broken"] = broken[0] + broken[1]
@@ -195,6 +201,10 @@ class CoAdaptation:
             seconds=seconds,
             diverged=dict(self.divergence.places),
         )
+
+    def _episode(self, env: MorphEnv, design: Tensor, **how: Any) -> TensorDict:
+        """An episode of the current body under pi_Ind."""
+        return run_episode(env, self.individual.policy, design=design, native=self.native_episodes, **how)
 
     def _observe(self, rows: TensorDictBase, *, first: bool) -> Means:
         """Scale the ensemble by the new rows, and say how well it foresaw them before it learns from them."""

@@ -84,18 +84,23 @@ def fingerprint(function: Callable[..., Any]) -> str:
     return hashlib.sha256("\n".join(_parts(function, set())).encode()).hexdigest()
 
 
+def folder() -> Path:
+    """Where compiled code of coim lies: in the folder of what Inductor compiles."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    return Path(cache_dir()) / PACKAGE
+
+
 def _is_of_coim(function: Callable[..., Any]) -> bool:
     return function.__module__.split(".")[0] == PACKAGE
 
 
 def _path(made_for: Hashable) -> Path:
     """Where the code lies."""
-    from torch._inductor.runtime.cache_dir_utils import cache_dir
-
     settings = sorted(torch._inductor.config.save_config_portable().items())
     torch_is = torch.__version__, torch.version.git_version, torch.backends.cpu.get_cpu_capability()
     made_from = (made_for, sys.version, torch_is, settings)
-    return Path(cache_dir()) / PACKAGE / hashlib.sha256(repr(made_from).encode()).hexdigest()
+    return folder() / hashlib.sha256(repr(made_from).encode()).hexdigest()
 
 
 def _parts(value: Any, seen: set[int]) -> Iterator[str]:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from coim.checkpoints import files_complaint, newest_whole, read_notes, read_state
 from coim.envs import BODIES, MorphEnv
+from coim.envs.native_episode import can_be_native
 from coim.episode import run_episode
 from coim.learners.flat_weights import read_networks
 from coim.models import GaussianEnsemble, NetworkSizes, Policy, QValue, select_run
@@ -158,7 +159,14 @@ class SavedRun:
             or with one of K runs alone, products are rounded differently, which a gait may amplify.
         """
         design = self.rewind(number)
-        return run_episode(self.bodies, self.policy_of(number), design=design, deterministic=True)
+        return run_episode(
+            self.bodies, self.policy_of(number), design=design, deterministic=True, native=self.acts_natively
+        )
+
+    @property
+    def acts_natively(self) -> bool:
+        """Whether the run's episodes were native code, where this machine can make it: others round differently."""
+        return bool(self.settings.get("native_episodes")) and can_be_native()
 
     def _best(self, number: int) -> dict[str, Any]:
         """What the run kept of a design's best evaluation, the rows of this run or of all, ``[K, ...]`` each."""

@@ -48,6 +48,7 @@ KINDS = {
     "paper": {},
     "baseline": {"imagine": False},
     "fleet": {"num_runs": 3},
+    "native episodes": {"num_runs": 3, "native_episodes": True},
     "side by side, mixed": {
         "side_by_side": True,
         "individual_mix": 0.2,

@@ -68,7 +68,7 @@ def test_matched_states_keep_all_but_the_height_of_the_root_and_none_is_in_the_f
     assert (clearance > -0.05).all()  # so every row is its own, in its place
     torch.testing.assert_close(env.clearance(rows["observation"], rows["design"]), clearance, atol=1e-5, rtol=0)
     moved = (rows["observation"] != states["observation"]).any(0).nonzero().flatten().tolist()
-    assert moved == [1 - env._first_position]
+    assert moved == [1 - env.first_position]
     if body is not HalfCheetahMorph:  # its legs are bent, and hardly any of its states goes into the floor
         stored = imagine(dream, states, policy, RandomDesigns(env.design_spec), rng=rng())
         assert impossible_pairs(env.clearance, stored["observation"], stored["design"]).float().mean() > 0.3

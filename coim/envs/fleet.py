@@ -35,6 +35,11 @@ def uniform_and_normal(num_positions: int, num_velocities: int, generator: torch
     return positions, torch.randn(num_velocities, generator=generator, dtype=torch.float64, device="cpu")
 
 
+def not_finite(action: Tensor) -> ValueError:
+    """The error of an action that is not finite."""
+    return ValueError(f"action {action.tolist()} is not finite; the policy that gave it has diverged")
+
+
 class Fleet:
     """The bodies of :class:`~coim.envs.morph.MorphEnv`; a subclass defines them by constants and :meth:`shape_body`.
 
@@ -42,6 +47,7 @@ class Fleet:
         simulations: the simulations themselves: live positions and velocities, and the compiled bodies.
         num_broken: how often the simulation of each row has broken, ``[K]`` int64.
         root: how the robot moves, and where its place stands in its positions.
+        motor_range: middle and reach of the control of each motor, ``[A]`` each; None where all are [-1, 1].
     """
 
     ASSET: ClassVar[str]  # XML file in assets/, or an absolute path
@@ -67,7 +73,7 @@ class Fleet:
         model = self.simulations.model(0)
         self.root = read_root(model, type(self).__name__)
         low, high = model.actuator_ctrlrange.T
-        self._range = None if (low == -1).all() and (high == 1).all() else ((low + high) / 2, (high - low) / 2)
+        self.motor_range = None if (low == -1).all() and (high == 1).all() else ((low + high) / 2, (high - low) / 2)
         self._observation = self._see()
         self._step_count = torch.zeros(num_runs, 1, dtype=torch.int64, device="cpu")
         self.num_broken = torch.zeros(num_runs, dtype=torch.int64, device="cpu")
@@ -123,7 +129,7 @@ class Fleet:
         return bounds[:, 0], bounds[:, 1]
 
     @property
-    def _first_position(self) -> int:
+    def first_position(self) -> int:
         """Index of the first observed entry of qpos."""
         return 0 if self._observes_place else self.root.unseen
 
@@ -148,8 +154,8 @@ class Fleet:
             >>> env.clearance(standing["observation"], standing["design"])  # the soles start 4 cm above the floor
             tensor([[0.0400]])
         """
-        positions = observation[..., : self._kinematics.num_positions - self._first_position]
-        unseen = positions.new_zeros(*positions.shape[:-1], self._first_position)
+        positions = observation[..., : self._kinematics.num_positions - self.first_position]
+        unseen = positions.new_zeros(*positions.shape[:-1], self.first_position)
         return self._kinematics.lowest(torch.cat([unseen, positions], -1), design)
 
     def transfer(self, observation: Tensor, design: Tensor, new_design: Tensor) -> Tensor:
@@ -177,7 +183,7 @@ class Fleet:
             tensor(0.4500)
         """
         rise = self.clearance(observation, design) - self.clearance(observation, new_design)
-        height = self._kinematics.height - self._first_position
+        height = self._kinematics.height - self.first_position
         observation = observation.expand(*rise.shape[:-1], -1)
         before, after = observation[..., :height], observation[..., height + 1 :]
         return torch.cat([before, observation[..., height, None] + rise, after], -1)
@@ -215,9 +221,9 @@ class Fleet:
             )
         torques = action.numpy()
         if not math.isfinite(torques.sum()):
-            raise ValueError(f"action {action.tolist()} is not finite; the policy that gave it has diverged")
-        if self._range is not None:
-            middle, reach = self._range
+            raise not_finite(action)
+        if self.motor_range is not None:
+            middle, reach = self.motor_range
             torques = middle + reach * torques
         self.simulations.ctrl[:] = torques
         broken = self.simulations.step(self.FRAME_SKIP)
@@ -230,6 +236,16 @@ class Fleet:
         self._observation = observation.clone()  # our own copy: the caller may write to the returned one
         self._step_count += 1
         return observation.to(device), terminated.to(device)
+
+    def have_moved(self, rows: np.ndarray, steps: Tensor) -> None:
+        """Take note that the simulations of some rows were stepped by somebody else than :meth:`move`.
+
+        Args:
+            rows: indices of the rows, ``[N]``.
+            steps: how often each row of the fleet was stepped, ``[K]``.
+        """
+        self._observation[rows] = self._see()[rows]
+        self._step_count[rows] += steps[rows].unsqueeze(-1)
 
     def place(self, observation: Tensor, design: Tensor) -> None:
         """Set the state and the body of each simulation, to compare a learnt model with the simulator.
@@ -254,9 +270,9 @@ class Fleet:
         self._build(design, rows)
         self.simulations.start(rows)
         qpos, qvel = self.simulations.qpos, self.simulations.qvel
-        num_positions = qpos.shape[1] - self._first_position
-        qpos[:, : self._first_position] = 0.0
-        qpos[:, self._first_position :] = state[:, :num_positions]
+        num_positions = qpos.shape[1] - self.first_position
+        qpos[:, : self.first_position] = 0.0
+        qpos[:, self.first_position :] = state[:, :num_positions]
         qvel[:] = state[:, num_positions:]
         self._step_count.zero_()
         self._observation = self._see()
@@ -384,7 +400,7 @@ class Fleet:
 
     def _see(self) -> Tensor:
         """Return the current observation ``[K, S]``: ``qpos, qvel`` with angles wrapped."""
-        first = self._first_position
+        first = self.first_position
         state = np.concatenate((self.simulations.qpos[:, first:], self.simulations.qvel), axis=1)
         for entry in self.root.angles:
             angle = state[:, entry - first]

@@ -143,12 +143,12 @@ class MorphEnv(Fleet, DesignedEnv):
     @property
     def angle_indices(self) -> tuple[int, ...]:
         """Indices of the observation's entries that are angles, wrapped to (-pi, pi]."""
-        return tuple(entry - self._first_position for entry in self.root.angles)
+        return tuple(entry - self.first_position for entry in self.root.angles)
 
     @property
     def quaternion_index(self) -> int | None:
         """Index of the first of the four entries of the observation that are a unit quaternion; None without one."""
-        return None if self.root.quaternion is None else self.root.quaternion - self._first_position
+        return None if self.root.quaternion is None else self.root.quaternion - self.first_position
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Step the fleet with tensors: like :meth:`step`, without tensordicts, and many times faster for few rows.
@@ -265,7 +265,7 @@ class MorphEnv(Fleet, DesignedEnv):
         name, size, scale = type(self).__name__, self._observation.shape[-1], self.OBSERVATION_SCALE
         if not isinstance(self.FRAME_SKIP, int) or self.FRAME_SKIP < 1:
             raise ValueError(f"{name}.FRAME_SKIP is {self.FRAME_SKIP}, not a whole number of at least 1")
-        if len(scale) not in (size, size + self._first_position) or not all(0 < entry < math.inf for entry in scale):
+        if len(scale) not in (size, size + self.first_position) or not all(0 < entry < math.inf for entry in scale):
             raise ValueError(
                 f"{name}.OBSERVATION_SCALE is {scale}, not {size} positive numbers, one for each observed quantity"
             )

@@ -10,7 +10,13 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import ctypes
+import functools
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,6 +25,12 @@ from mujoco.batch import Batch, SimulationError
 from coim.envs.root import BOX, CAPSULE, CYLINDER, ELLIPSOID, FREE, SPHERE, colliding, find_height
 
 BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: far beyond any working body; MuJoCo itself warns only from 1e10 on
+
+
+class _BatchConfig(ctypes.Structure):
+    """MuJoCo's ``mjBatchConfig``."""
+
+    _fields_ = [("nthread", ctypes.c_int), ("persistent", ctypes.c_ubyte)]
 
 
 class Simulations:
@@ -52,6 +64,7 @@ class Simulations:
         self._models = self._compiled(designs)
         self._batch = Batch(self._models[0], len(designs), num_threads)
         self._batch.set_models(self._models)
+        self._num_threads = num_threads
         self.state: np.ndarray = self._batch.state
         self.qpos, self.qvel, self.ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._warnings = self._batch.warning[:, :, 1]  # number of warnings of each kind, [K, kinds]
@@ -109,6 +122,43 @@ class Simulations:
             return self._mend(failed)
         return failed
 
+    def apply(self, function: Any, argument: Any, rows: np.ndarray) -> np.ndarray:
+        """Run native code on some simulations, on native threads, and keep the states that it leaves.
+
+        Args:
+            function: of C, ``void function(const mjModel*, mjData*, int row, void* argument)``.
+            argument: what it gets, as ctypes passes it.
+            rows: which simulations, ``[N]``.
+
+        Returns:
+            Rows in which MuJoCo raised; they keep the states they had.
+        """
+        batch, states, status = self._native
+        library, ids = mujoco_library(), np.ascontiguousarray(rows, dtype=np.int32)
+        bodies = (ctypes.c_void_p * len(self._models))(*(model._address for model in self._models))
+        library.mjb_setModels(batch, bodies)
+        states[rows] = self.state[rows]
+        with self._silent():
+            library.mjb_apply(batch, ids.ctypes.data, len(ids), function, argument, 1)
+        self.state[rows] = states[rows]
+        return rows[status[rows] != 0]
+
+    @functools.cached_property
+    def _native(self) -> tuple[ctypes.c_void_p, np.ndarray, np.ndarray]:
+        """A batch for :meth:`apply`, its states ``[K, n]`` and whether each simulation raised ``[K]``.
+
+        `mujoco.batch.Batch` does not give the address of its own.
+        """
+        library, size = mujoco_library(), len(self._models)
+        reason = ctypes.create_string_buffer(1000)
+        config = _BatchConfig(self._num_threads, 0)
+        batch = library.mjb_makeBatch(self._models[0]._address, size, ctypes.byref(config), reason, len(reason))
+        if not batch:
+            raise RuntimeError(f"MuJoCo makes no batch of {size} simulations: {reason.value.decode()}")
+        weakref.finalize(self, library.mjb_deleteBatch, batch)
+        states = np.ctypeslib.as_array(library.mjb_state(batch), self.state.shape)
+        return batch, states, np.ctypeslib.as_array(library.mjb_status(batch), (size,))
+
     def lift_out_of_floor(self, row: int) -> None:
         """Lift a robot onto the floor if one of its parts is below it; one on a fixed base stays."""
         if self._height is not None and (lowest := self.lowest_point(row)) < 0:
@@ -140,15 +190,22 @@ class Simulations:
 
     def _step_silently(self, num_steps: int) -> np.ndarray:
         """Step without writing MUJOCO_LOG.TXT to the user's folder; :meth:`step` returns the broken rows instead."""
+        with self._silent():
+            try:
+                self._batch.step(nstep=num_steps)
+            except SimulationError as error:
+                return np.asarray(error.ids)
+        return np.empty(0, dtype=np.int64)
+
+    @contextmanager
+    def _silent(self) -> Iterator[None]:
+        """Let MuJoCo write no log."""
         chosen_by_user = mujoco.MjLogConfig.get()
         self._silence.set()
         try:
-            self._batch.step(nstep=num_steps)
-        except SimulationError as error:
-            return np.asarray(error.ids)
+            yield
         finally:
             chosen_by_user.set()
-        return np.empty(0, dtype=np.int64)
 
     def _mend(self, failed: np.ndarray) -> np.ndarray:
         """Find the broken rows and start them again; this clears their warnings too."""
@@ -157,6 +214,22 @@ class Simulations:
         rows = np.flatnonzero(broken)
         self.start(rows)
         return rows
+
+
+@functools.cache
+def mujoco_library() -> ctypes.CDLL:
+    """MuJoCo's own library, the one that its Python package has loaded."""
+    (path,) = Path(mujoco.__file__).parent.glob("libmujoco*")
+    library = ctypes.CDLL(str(path))
+    pointer, number = ctypes.c_void_p, ctypes.c_int
+    library.mjb_makeBatch.restype = pointer
+    library.mjb_makeBatch.argtypes = [pointer, number, pointer, ctypes.c_char_p, number]
+    library.mjb_deleteBatch.restype, library.mjb_deleteBatch.argtypes = None, [pointer]
+    library.mjb_setModels.restype, library.mjb_setModels.argtypes = None, [pointer, pointer]
+    library.mjb_apply.argtypes = [pointer, pointer, number, pointer, pointer, number]
+    library.mjb_state.restype, library.mjb_state.argtypes = ctypes.POINTER(ctypes.c_double), [pointer]
+    library.mjb_status.restype, library.mjb_status.argtypes = ctypes.POINTER(ctypes.c_int), [pointer]
+    return library
 
 
 def lowest_point(model: mujoco.MjModel, data: mujoco.MjData) -> float:

@@ -42,7 +42,7 @@ from coim.experiments.run.progress import Progress
 from coim.experiments.run.results import Results, folder_of
 from coim.experiments.run.resume import begin_or_resume
 from coim.experiments.run.run_log import FORMERLY, RunLog
-from coim.experiments.run.settings import QUICK, Settings
+from coim.experiments.run.settings import QUICK, Settings, option
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
@@ -91,8 +91,8 @@ def train(
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
     products = begin_or_resume(name, settings)
-    if settings.compile:
-        check_compiler()
+    if needing := [name for name in ("compile", "native_episodes") if getattr(settings, name)]:
+        check_compiler(without=" ".join(option(f"no_{name}") for name in needing))
     with folder_of(name, settings) as folder:
         algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:

@@ -70,6 +70,22 @@ class PolicyNetwork(nn.Module):
         loc, log_scale = self.mlp(observation, design).chunk(2, -1)
         return loc, log_scale.clamp(*LOG_SCALE_RANGE).exp()
 
+    def constants(self, design: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor, Tensor]:
+        """Return what does not change during an episode, without gradients.
+
+        Args:
+            design: ``[K, D]``, a row for each body.
+
+        Returns:
+            Weight ``[(K,) inputs, outputs]`` and bias ``[(K,) outputs]`` of each layer, as they lie in memory; what
+            observations are divided by, ``[S]``; and the designs as the first layer reads them, ``[K, D]``.
+        """
+        parameters = [parameter.detach() for parameter in self.mlp.parameters()]  # weight, bias, weight, bias, ...
+        layers = list(zip(parameters[0::2], parameters[1::2]))
+        if self.scaling is None:
+            return layers, design.new_ones(self.mlp.in_features - design.shape[-1]), design
+        return layers, self.scaling.observation_scale, self.scaling.scaled_design(design)
+
     def for_design(self, design: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
         """Return a faster `forward` for an episode, in which the designs are constant; see `Policy.is_unaltered`.
 
@@ -82,17 +98,15 @@ class PolicyNetwork(nn.Module):
         Returns:
             A function of observations ``[K, S]`` that returns ``loc`` and ``scale``, ``[K, A]``, without gradients.
         """
+        layers, scale, scaled = self.constants(design)
         fleet = self.mlp.num_runs is not None
-        parameters = [parameter.detach() for parameter in self.mlp.parameters()]  # weight, bias, weight, bias, ...
-        layers = list(zip(parameters[0::2], parameters[1::2]))
         if fleet:
             layers = [(weight, bias.unsqueeze(1)) for weight, bias in layers]
         (*hidden, (last_weight, last_bias)) = layers
         product = torch.baddbmm if fleet else torch.addmm
-        num_observations = self.mlp.in_features - design.shape[-1]
+        num_observations = len(scale)
         inputs = design.new_empty(len(design), self.mlp.in_features)
-        scale = design.new_ones(num_observations) if self.scaling is None else self.scaling.observation_scale
-        inputs[:, num_observations:] = design if self.scaling is None else self.scaling.scaled_design(design)
+        inputs[:, num_observations:] = scaled
         observed, first = inputs[:, :num_observations], inputs.unsqueeze(1) if fleet else inputs
 
         def network(observation: Tensor) -> tuple[Tensor, Tensor]:

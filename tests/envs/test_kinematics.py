@@ -28,8 +28,8 @@ def lowest_point(env: MorphEnv, observation: Tensor, design: Tensor) -> float:
     """The lowest point of the body's capsules by MuJoCo's kinematics, in m."""
     model = env.simulations.body(design.numpy()).compile()
     data = mujoco.MjData(model)
-    seen = observation.numpy()[: model.nq - env._first_position]
-    data.qpos[env._first_position :] = seen
+    seen = observation.numpy()[: model.nq - env.first_position]
+    data.qpos[env.first_position :] = seen
     mujoco.mj_kinematics(model, data)
     of_robot = model.geom_bodyid > 0
     radius, half = model.geom_size[of_robot, 0], model.geom_size[of_robot, 1]
@@ -54,7 +54,7 @@ def test_a_transferred_state_keeps_its_joints_velocities_and_clearance_and_comes
     moved = env.transfer(observation, design, other)
     changed = (moved != observation).any(0)
     assert changed.nonzero().flatten().tolist() == [
-        env._kinematics.height - env._first_position
+        env._kinematics.height - env.first_position
     ]  # the height of the root
     torch.testing.assert_close(env.clearance(moved, other), env.clearance(observation, design))
     torch.testing.assert_close(env.transfer(moved, other, design), observation)

@@ -182,4 +182,5 @@ def take(loaded: SavedRun, tried: TriedDesign, policy: PolicyName, width: int, h
         same = {other.run: other.design for other in loaded.designs if other.number == tried.number}
         designs = torch.stack([same.get(other, tried.design) for other in range(loaded.bodies.numel())])
         network = loaded.population.policy
-    return play(loaded.bodies, network, designs, row=tried.run, title=title, width=width, height=height)
+    native = loaded.acts_natively
+    return play(loaded.bodies, network, designs, row=tried.run, title=title, width=width, height=height, native=native)

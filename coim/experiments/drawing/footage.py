@@ -76,6 +76,7 @@ def play(
     title: str,
     width: int,
     height: int,
+    native: bool = False,
 ) -> Take:
     """Play an episode twice: for the actions, and for the poses that they lead to.
 
@@ -87,9 +88,10 @@ def play(
         title: first line of each picture.
         width: of a picture in pixels.
         height: of a picture in pixels.
+        native: see `coim.run_episode`.
     """
     start = bodies.get_simulation_state()
-    actions = run_episode(bodies, policy, design=designs, deterministic=True)["action"]
+    actions = run_episode(bodies, policy, design=designs, deterministic=True, native=native)["action"]
     bodies.set_simulation_state(start)
     bodies.reset(TensorDict({"design": designs}, bodies.batch_size))
     simulations = bodies.simulations

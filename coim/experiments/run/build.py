@@ -90,6 +90,7 @@ def build(body: type[MorphEnv], settings: Settings, *, threads: int = 1, side_by
         episodes=settings.episodes,
         updates=update_plan(settings),
         side_by_side=side_by_side,
+        native_episodes=settings.native_episodes,
         seed=seed,
     )
 

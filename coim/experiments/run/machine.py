@@ -34,15 +34,18 @@ def checked_device(name: str) -> torch.device:
     return device
 
 
-def check_compiler() -> None:
+def check_compiler(without: str = "--no-compile --no-native-episodes") -> None:
     """Refuse to compile where it cannot work, before anything is written.
+
+    Args:
+        without: options that do without, for the message.
 
     Raises:
         ValueError: if there is no C++ compiler, or what it makes could not be loaded from where Inductor puts it.
     """
     asked = os.environ.get("CXX")
     if not any(shutil.which(name) for name in ([asked] if asked else ["g++", "clang++", "c++"])):
-        raise ValueError(f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or --no-compile")
+        raise ValueError(f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or {without}")
     folder = folder_of_compiled_code()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     noexec = hasattr(os, "ST_NOEXEC") and os.statvfs(there).f_flag & os.ST_NOEXEC
@@ -50,7 +53,7 @@ def check_compiler() -> None:
         why = "is mounted noexec" if noexec else "cannot be written to"
         raise ValueError(
             f"compiled code is put into {folder} and loaded from there, which {why}; name another folder by the "
-            "environment variable TORCHINDUCTOR_CACHE_DIR, or --no-compile"
+            f"environment variable TORCHINDUCTOR_CACHE_DIR, or {without}"
         )
 
 

@@ -22,12 +22,12 @@ from coim.run_folder import read_config
 # later numbers differently, as other versions do.
 FREE = {"num_designs", "threads", "products", "checkpoint_every", "resume", "log", "wandb", "quiet"}
 # Settings that may change because the machine may lack what they name. Later numbers differ, at first within rounding.
-ELSEWHERE = ("device", "replay_device", "compile")
+ELSEWHERE = ("device", "replay_device", "compile", "native_episodes")
 # Settings that may differ between a finished cell of a study and the same cell as it is asked for.
 OF_NO_NUMBER = FREE | {"out", "device", "replay_device", "name"}
 # Settings that older folders lack. Their defaults are what every run had before.
 LATER = {"replay_device", "products", "value_states", "value_over", "chosen_by", "reach", "widening"}
-LATER |= {"log", "imagined_states", "imagined_actions", "anchored", "governed"}
+LATER |= {"log", "imagined_states", "imagined_actions", "anchored", "governed", "native_episodes"}
 FORMERLY = Choice("onednn", "onednn")  # the products of runs whose folder does not name them
 
 

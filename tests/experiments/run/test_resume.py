@@ -139,25 +139,33 @@ def test_a_run_goes_on_where_there_is_no_gpu_and_no_compiler(
 ) -> None:
     folder = cut(tmp_path / "cut", 6)
     config = json.loads((folder / "config.json").read_text())
-    config["settings"] |= {"device": "cuda", "compile": True}
+    config["settings"] |= {"device": "cuda", "compile": True, "native_episodes": True}
     (folder / "config.json").write_text(json.dumps(config))
     if not torch.cuda.is_available():
         with pytest.raises(SystemExit, match=r"device 'cuda' cannot be used here .*; try --device cpu"):
             resume(folder)
     monkeypatch.setenv("CXX", "no-such-compiler")
-    with pytest.raises(SystemExit, match=r"no C\+\+ compiler .* or --no-compile"):
+    with pytest.raises(SystemExit, match=r"no C\+\+ compiler .* or --no-compile --no-native-episodes"):
         resume(folder, "--device", "cpu")
     capsys.readouterr()
-    resume(folder, "--device", "cpu", "--no-compile")
+    with pytest.raises(SystemExit, match=r"no C\+\+ compiler .* or --no-native-episodes"):
+        resume(folder, "--device", "cpu", "--no-compile")
+    capsys.readouterr()
+    resume(folder, "--device", "cpu", "--no-compile", "--no-native-episodes")
     said = capsys.readouterr().err.splitlines()
     assert [line for line in said if "products" not in line] == [
         "warning: device was cuda and is cpu; the numbers may differ from here",
         "warning: compile was True and is False; the numbers may differ from here",
+        "warning: native_episodes was True and is False; the numbers may differ from here",
     ]
     assert soak.differences(whole, folder) == []  # it was cpu and not compiled in truth
     config = json.loads((folder / "config.json").read_text())
     assert config["settings"]["device"] == "cpu"
-    assert config["resumed"][-1]["changed"] == {"device": ["cuda", "cpu"], "compile": [True, False]}
+    assert config["resumed"][-1]["changed"] == {
+        "device": ["cuda", "cpu"],
+        "compile": [True, False],
+        "native_episodes": [True, False],
+    }
 
 
 def test_generators_of_a_gpu_that_is_not_here_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:

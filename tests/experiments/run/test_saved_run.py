@@ -79,6 +79,24 @@ def test_the_best_evaluation_of_every_design_can_be_played_again(fleet: Made) ->
         assert torch.allclose(played["design"][0], torch.stack([design.design for design in tried]), rtol=1e-6)
 
 
+def test_the_best_evaluation_of_a_native_run_is_played_again_to_the_last_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = run(tmp_path / "run", num_runs=2, native_episodes=True, episode_steps=80)
+    loaded = load_run(folder)
+    for number in (1, 4):
+        returns = loaded.best_episode(number)["next", "reward"].sum(0).flatten().tolist()
+        expected = [tried.best_return for tried in loaded.designs if tried.number == number]
+        assert returns == pytest.approx(expected, rel=1e-6)
+        alone = load_run(folder, run=1).best_episode(number)["next", "reward"].sum()
+        assert float(alone) == pytest.approx(expected[1], rel=1e-6)
+    with monkeypatch.context() as patched:
+        patched.setattr("coim.saved_run.can_be_native", lambda: False)  # a machine without a compiler
+        in_python = loaded.best_episode(1)["action"]
+    assert not torch.equal(in_python, loaded.best_episode(1)["action"])
+    torch.testing.assert_close(in_python[:9], loaded.best_episode(1)["action"][:9], rtol=0, atol=1e-4)
+
+
 def test_a_run_is_opened_as_it_was_whatever_torchs_default_dtype(fleet: Made) -> None:
     expected = load_run(fleet[0])
     torch.set_default_dtype(torch.float64)

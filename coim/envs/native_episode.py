@@ -1,0 +1,241 @@
+"""Whole episodes as native code: ``native_episode.cpp``, made by the C++ compiler that `torch.compile` needs too.
+
+In Python a step of one body takes two to eight times as long as its physics: some thirty calls of torch, numpy and
+MuJoCo, each of a few microseconds. Here the bodies, which do not depend on each other, go through their episode one by
+one, or as many at once as there are threads.
+
+Shapes: T steps, K runs, S observation, D design, A action.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from coim.envs.fleet import not_finite
+from coim.envs.morph import MorphEnv
+from coim.envs.simulation import BEYOND_PHYSICS, mujoco_library
+from coim.kept_code import folder
+
+SOURCE = Path(__file__).with_suffix(".cpp")
+# Sums in the order that they are written in, and products that are fused only where the source says so.
+OPTIONS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-shared", "-fPIC")
+BROKEN, NOT_FINITE = 1, 2  # as in the source
+
+
+class _Layer(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("weight", "bias")] + [
+        (name, ctypes.c_int64) for name in ("next_weight", "next_bias", "inputs", "outputs")
+    ]
+
+
+class _Episode(ctypes.Structure):
+    """As in the source, where the fields are explained."""
+
+    _fields_ = (
+        [("step", ctypes.c_void_p)]
+        + [(name, ctypes.c_int64) for name in ("bodies", "steps", "substeps", "observed", "designed", "acted")]
+        + [(name, ctypes.c_int64) for name in ("unseen", "angles", "layers", "width")]
+        + [(name, ctypes.c_void_p) for name in ("angle", "middle", "reach")]
+        + [("beyond", ctypes.c_double)]
+        + [(name, ctypes.c_void_p) for name in ("layer", "scale", "design", "noise")]
+        + [("least", ctypes.c_float), ("most", ctypes.c_float)]
+        + [(name, ctypes.c_void_p) for name in ("observation", "action", "following", "scratch", "next", "ending")]
+    )
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A tanh-Gaussian policy of ReLU layers, as the constants of an episode.
+
+    Attributes:
+        layers: weight ``[inputs, outputs]`` and bias ``[outputs]`` of each layer; ``[K, inputs, outputs]`` and
+            ``[K, outputs]`` if every run has a policy of its own. The last layer returns ``loc`` and the log-scale.
+        observation_scale: ``[S]``, by which observations are divided.
+        design: ``[K, D]``, as the network reads it.
+        log_scale_range: least and largest log-scale.
+    """
+
+    layers: Sequence[tuple[Tensor, Tensor]]
+    observation_scale: Tensor
+    design: Tensor
+    log_scale_range: tuple[float, float]
+
+    def is_plain(self) -> bool:
+        """Whether all numbers are finite, in float32 and on the CPU: others act in Python, which says what is wrong."""
+        tensors = [self.observation_scale, self.design, *(tensor for layer in self.layers for tensor in layer)]
+        kinds = {(tensor.dtype, tensor.device.type) for tensor in tensors}
+        return kinds == {(torch.float32, "cpu")} and all(bool(tensor.isfinite().all()) for tensor in tensors)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Where an episode is written, all on the CPU.
+
+    Attributes:
+        observation: ``[T, K, S]``.
+        action: ``[T, K, A]``.
+        following: ``[T, K, S]``, the next observations.
+        broken: ``[T, K, 1]`` bool, whether the simulation broke in this step.
+    """
+
+    observation: Tensor
+    action: Tensor
+    following: Tensor
+    broken: Tensor
+
+
+def play(env: MorphEnv, actor: Actor, noise: Tensor | None, rows: Rows) -> None:
+    """Let the bodies act from where they stand, and write the rows.
+
+    A body whose simulation breaks starts again, as in `coim.run_episode`.
+
+    Args:
+        env: the bodies.
+        actor: their policies.
+        noise: standard normal, ``[T, K, A]``; None acts by the mode.
+        rows: to be written to, with ``broken`` all False.
+
+    Raises:
+        ValueError: if an action is not finite.
+        RuntimeError: if the code cannot be compiled.
+    """
+    steps, bodies = rows.broken.shape[:2]
+    keep: list[Tensor] = []  # what the pointers point to
+
+    def pointer(tensor: Tensor | None) -> int | None:
+        if tensor is None:
+            return None
+        keep.append(tensor)
+        return tensor.data_ptr()
+
+    layers = (_Layer * len(actor.layers))()
+    for layer, (weight, bias) in zip(layers, actor.layers):
+        own = weight.dim() == 3  # one for each body, which may lie apart
+        weight, bias = (x if (x[0] if own else x).is_contiguous() else x.contiguous() for x in (weight, bias))
+        layer.weight, layer.bias = pointer(weight), pointer(bias)
+        layer.next_weight, layer.next_bias = (weight.stride(0), bias.stride(0)) if own else (0, 0)
+        layer.inputs, layer.outputs = weight.shape[-2:]
+    width = max(max(layer.inputs, layer.outputs) for layer in layers)
+    angles = torch.tensor([entry - env.first_position for entry in env.root.angles], dtype=torch.int64, device="cpu")
+    middle, reach = (None, None) if env.motor_range is None else map(torch.from_numpy, env.motor_range)
+    upcoming = torch.zeros(bodies, dtype=torch.int64, device="cpu")
+    ending = torch.zeros(bodies, dtype=torch.int64, device="cpu")
+    episode = _Episode(
+        step=ctypes.cast(mujoco_library().mj_step, ctypes.c_void_p),
+        bodies=bodies,
+        steps=steps,
+        substeps=env.FRAME_SKIP,
+        observed=rows.observation.shape[-1],
+        designed=actor.design.shape[-1],
+        acted=rows.action.shape[-1],
+        unseen=env.first_position,
+        angles=len(angles),
+        layers=len(layers),
+        width=width,
+        angle=pointer(angles),
+        middle=pointer(middle),
+        reach=pointer(reach),
+        beyond=BEYOND_PHYSICS,
+        layer=ctypes.cast(layers, ctypes.c_void_p),
+        scale=pointer(actor.observation_scale.contiguous()),
+        design=pointer(actor.design.contiguous()),
+        noise=pointer(None if noise is None else noise.contiguous()),
+        least=actor.log_scale_range[0],
+        most=actor.log_scale_range[1],
+        observation=pointer(rows.observation),
+        action=pointer(rows.action),
+        following=pointer(rows.following),
+        scratch=pointer(torch.empty(bodies, 2 * width, dtype=torch.float32, device="cpu")),
+        next=pointer(upcoming),
+        ending=pointer(ending),
+    )
+    to_go = np.arange(bodies)
+    while to_go.size:
+        before = upcoming.clone()
+        ending.zero_()
+        failed = env.simulations.apply(library().act, ctypes.byref(episode), to_go)
+        for row in failed:  # MuJoCo raised within a step: it is the last one, and leads nowhere
+            at = int(upcoming[row])
+            rows.following[at, row] = rows.observation[at, row]
+            upcoming[row], ending[row] = at + 1, BROKEN
+        env.have_moved(to_go, upcoming - before)
+        if (ending == NOT_FINITE).any():
+            row = int((ending == NOT_FINITE).nonzero()[0])
+            raise not_finite(rows.action[upcoming[row], row])
+        broken = (ending == BROKEN).numpy()
+        rows.broken[upcoming.numpy()[broken] - 1, np.flatnonzero(broken)] = True
+        if broken.any():
+            env.num_broken += torch.from_numpy(broken)
+            again = torch.from_numpy(broken).unsqueeze(-1)
+            env.reset(TensorDict({"_reset": again}, env.batch_size, device=env.device))
+        to_go = np.flatnonzero(broken & (upcoming < steps).numpy())
+
+
+def can_be_native() -> bool:
+    """Whether there is native code of episodes on this machine, or it can be made."""
+    try:
+        library()
+    except (RuntimeError, OSError):
+        return False
+    return True
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The compiled source, of an earlier process or made now.
+
+    Raises:
+        RuntimeError: if there is no compiler, or it cannot compile the source; the message has its words.
+    """
+    compiler = _compiler()
+    include = Path(mujoco.__file__).parent / "include"
+    # What the compiler predefines names its version and what the processor can do: a home folder may serve others.
+    predefined = _run([compiler, *OPTIONS, "-dM", "-E", "-x", "c++", os.devnull])
+    parts = (SOURCE.read_text(), predefined, mujoco.__version__, repr(OPTIONS))
+    path = folder() / f"episode-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.so"
+    if path.exists():
+        try:
+            return ctypes.CDLL(str(path))
+        except OSError:  # half a file
+            pass
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as beside:
+        made = Path(beside) / path.name
+        _run([compiler, *OPTIONS, f"-I{include}", str(SOURCE), "-o", str(made)])
+        os.replace(made, path)
+    return ctypes.CDLL(str(path))
+
+
+def _compiler() -> str:
+    """The C++ compiler that Inductor would take."""
+    asked = os.environ.get("CXX")
+    for name in [asked] if asked else ["g++", "clang++", "c++"]:
+        if (found := shutil.which(name)) is not None:
+            return found
+    raise RuntimeError(
+        f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or leave native episodes out"
+    )
+
+
+def _run(command: list[str]) -> str:
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(
+            f"native episodes cannot be compiled, leave them out; {' '.join(command)}: {done.stderr[-2000:]}"
+        )
+    return done.stdout

@@ -1,0 +1,270 @@
+"""Episodes in native code: the physics of each row to the last bit, and the policy's actions up to rounding."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from coim import (
+    AntMorph,
+    HalfCheetahMorph,
+    HopperMorph,
+    MorphEnv,
+    Policy,
+    WalkerMorph,
+    make_policy,
+    morph_from_mjcf,
+    run_episode,
+    select_run,
+)
+from coim.buffers import ROW_KEYS
+from coim.envs import native_episode
+from coim.envs.native_episode import can_be_native, library
+
+STEPS = 60
+ARM = """
+<mujoco><option timestep=".01"/>
+  <worldbody><body name="upper">
+    <joint name="shoulder" axis="0 0 1" damping=".1"/>
+    <geom name="upper" type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>
+    <body name="lower" pos=".5 0 0">
+      <joint name="elbow" axis="0 0 1" range="-150 150" damping=".1"/>
+      <geom name="lower" type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
+    </body>
+  </body></worldbody>
+  <actuator><motor joint="shoulder" gear="5" ctrlrange="-2 2"/><motor joint="elbow" ctrlrange="0 3"/></actuator>
+</mujoco>
+"""
+
+
+def rng() -> torch.Generator:
+    return torch.Generator().manual_seed(5)
+
+
+def replayed(env: MorphEnv, actions: Tensor, design: Tensor) -> TensorDict:
+    """The same actions once more, each given to the bodies from Python."""
+    left = iter(actions)
+    policy = TensorDictModule(lambda observation: next(left), in_keys=["observation"], out_keys=["action"])
+    return run_episode(env, policy, design=design)
+
+
+def same_state(one: MorphEnv, other: MorphEnv) -> bool:
+    return bool((one.get_simulation_state() == other.get_simulation_state()).all())
+
+
+def natively_and_replayed(
+    make: Callable[[], MorphEnv], policy: Policy, design: Tensor, *, deterministic: bool = False
+) -> tuple[TensorDict, TensorDict]:
+    """Rows of two episodes in a row, after which both fleets are in the same state."""
+    native, again = make(), make()
+    rows = [run_episode(native, policy, design=design, deterministic=deterministic, rng=rng(), native=True)]
+    others = [replayed(again, rows[0]["action"], design)]
+    assert same_state(native, again)
+    rows.append(run_episode(native, policy, deterministic=deterministic, rng=rng(), native=True))
+    others.append(replayed(again, rows[1]["action"], design))
+    assert same_state(native, again)
+    return torch.cat(rows), torch.cat(others)
+
+
+def arm(tmp_path: Path) -> type[MorphEnv]:
+    """A robot on a fixed base, whose motors have ranges of their own and whose shoulder turns for ever."""
+    file = tmp_path / "arm.xml"
+    file.write_text(ARM)
+    return morph_from_mjcf(file, scale={"upper": ["upper"], "lower": ["lower"]}, reward=still)
+
+
+def still(observation: Tensor, action: Tensor, next_observation: Tensor, design: Tensor, task: str) -> Tensor:
+    return torch.zeros_like(observation[..., :1])
+
+
+def noise_of(shape: tuple[int, ...]) -> Tensor:
+    return torch.randn(STEPS, *shape, generator=rng())
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("body", [HopperMorph, HalfCheetahMorph, WalkerMorph, AntMorph, "arm"])
+def test_rows_are_those_of_the_same_actions_and_actions_those_of_the_policy(
+    body: type[MorphEnv] | str, own: bool, deterministic: bool, tmp_path: Path
+) -> None:
+    kind = arm(tmp_path) if isinstance(body, str) else body
+    env = kind(num_runs=3, seed=0, episode_steps=STEPS)
+    policy = make_policy(env, num_cells=(23, 9), num_runs=3 if own else None)
+    design = env.design_spec.rand((3,))
+    rows, again = natively_and_replayed(
+        lambda: kind(num_runs=3, seed=0, episode_steps=STEPS), policy, design, deterministic=deterministic
+    )
+    for key in ROW_KEYS:
+        assert torch.equal(rows[key], again[key]), key
+    with torch.no_grad():
+        loc, scale = policy.network(rows["observation"], rows["design"])
+    noise = 0.0 if deterministic else noise_of(loc.shape[1:]).repeat(2, 1, 1)
+    torch.testing.assert_close(rows["action"], (loc + scale * noise).tanh(), rtol=0, atol=2e-6)
+    assert rows["action"].std() > 0.01
+
+
+def test_one_body_acts_as_it_does_in_a_fleet_and_with_any_number_of_threads() -> None:
+    fleet, threaded = (
+        HopperMorph(num_runs=3, seed=0, reset_noise=0.0, episode_steps=STEPS, num_threads=threads) for threads in (1, 3)
+    )
+    policy = make_policy(fleet, num_cells=(32, 32), num_runs=3)
+    design = fleet.design_spec.rand((3,))
+    rows = run_episode(fleet, policy, design=design, deterministic=True, native=True)
+    assert (run_episode(threaded, policy, design=design, deterministic=True, native=True) == rows).all()
+    alone = HopperMorph(reset_noise=0.0, episode_steps=STEPS)
+    own = run_episode(alone, select_run(policy, 1), design=design[1:2], deterministic=True, native=True)
+    assert (own == rows[:, 1:2]).all()
+
+
+def test_a_body_that_breaks_starts_again_while_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What counts as broken is set so low that hopping does it, now and then."""
+    for module in ("native_episode", "simulation"):
+        monkeypatch.setattr(f"coim.envs.{module}.BEYOND_PHYSICS", 5.0)
+    env = HopperMorph(num_runs=4, seed=0, episode_steps=STEPS)
+    policy = make_policy(env, num_cells=(8,), num_runs=4)
+    make = lambda: HopperMorph(num_runs=4, seed=0, episode_steps=STEPS)  # noqa: E731
+    rows, again = natively_and_replayed(make, policy, torch.ones(4, 4))
+    broken = rows["next", "terminated"].sum(0).squeeze(-1)
+    assert broken.max() > 2
+    assert len(broken.unique()) > 1
+    for key in ROW_KEYS:
+        assert torch.equal(rows[key], again[key]), key
+
+
+def test_an_error_of_mujoco_within_an_episode_breaks_the_body_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A body with too little memory for its contacts."""
+    asset = Path(native_episode.__file__).parent / "assets" / "hopper.xml"
+    (tmp_path / "small.xml").write_text(asset.read_text().replace("<worldbody>", '<size memory="8K"/><worldbody>'))
+
+    class Small(HopperMorph):
+        ASSET = str(tmp_path / "small.xml")
+
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    make = lambda: Small(num_runs=2, seed=0, episode_steps=300)  # noqa: E731
+    rows, again = natively_and_replayed(make, make_policy(make(), num_cells=(8,), num_runs=2), torch.ones(2, 4))
+    assert rows["next", "terminated"].any()
+    for key in ROW_KEYS:
+        assert torch.equal(rows[key], again[key]), key
+    assert list(Path.cwd().iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("weight", [3e38, float("nan")])
+def test_an_action_that_is_not_finite_is_refused_as_in_python(weight: float) -> None:
+    env = HopperMorph(num_runs=2, seed=0, episode_steps=5)
+    policy = make_policy(env, num_cells=(8,), num_runs=2)
+    with torch.no_grad():
+        for layer in policy.network.mlp.parameters():
+            layer[1] = weight * torch.ones_like(layer[1]).cumsum(-1).sub(3).sign()
+    start = HopperMorph(num_runs=2, seed=0)
+    start.reset()
+    with pytest.raises(ValueError, match=r"nan.* is not finite; the policy that gave it has diverged"):
+        run_episode(env, policy, native=True)
+    assert (env.simulations.qpos[1] == start.simulations.qpos[1]).all()
+    assert (env.num_broken == 0).all()
+
+
+def test_bodies_that_move_in_a_way_of_their_own_and_altered_policies_act_in_python() -> None:
+    class Watched(HopperMorph):
+        moves = 0
+
+        def move(self, action: Tensor) -> tuple[Tensor, Tensor]:
+            self.moves += 1
+            return super().move(action)
+
+    env, plain = Watched(seed=0, episode_steps=5), HopperMorph(seed=0, episode_steps=5)
+    policy = make_policy(plain, num_cells=(8,))
+    rows = run_episode(env, policy, rng=rng(), native=True)
+    assert env.moves == 5
+    assert (rows == run_episode(plain, policy, rng=rng())).all()
+
+    hooked = deepcopy(policy)
+    hooked.network.mlp.layers[0].register_forward_hook(lambda module, given, out: -out)
+    one, other = (HopperMorph(seed=0, episode_steps=5) for _ in range(2))
+    assert (run_episode(one, hooked, rng=rng(), native=True) == run_episode(other, hooked, rng=rng())).all()
+
+
+def test_a_policy_of_other_numbers_acts_in_python() -> None:
+    one, other = (HopperMorph(seed=0, episode_steps=5) for _ in range(2))
+    policy = make_policy(one, num_cells=(8,)).double()
+    module = TensorDictModule(
+        lambda observation, design: policy.deterministic_action(observation.double(), design.double()).float(),
+        in_keys=["observation", "design"],
+        out_keys=["action"],
+    )
+    assert (run_episode(one, module, native=True) == run_episode(other, module)).all()
+
+
+def test_code_is_made_once_for_all_processes_and_anew_if_it_is_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    runs: list[list[str]] = []
+    really = native_episode._run
+    monkeypatch.setattr(native_episode, "_run", lambda command: (runs.append(command), really(command))[1])
+    compiled = lambda: [command for command in runs if "-o" in command]  # noqa: E731
+    library.__wrapped__()
+    (made,) = tmp_path.rglob("*.so")
+    library.__wrapped__()
+    assert len(compiled()) == 1
+    # Elsewhere, since a process loads no second library of the same path.
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "other"))
+    damaged = tmp_path / "other" / made.relative_to(tmp_path)
+    damaged.parent.mkdir(parents=True)
+    damaged.write_bytes(made.read_bytes()[:100])
+    library.__wrapped__()
+    assert len(compiled()) == 2
+    assert list((tmp_path / "other").rglob("*.so")) == [damaged]
+    assert damaged.stat().st_size == made.stat().st_size
+
+
+def test_without_a_compiler_or_with_one_that_fails_a_sentence_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    library.cache_clear()
+    try:
+        monkeypatch.setenv("CXX", "no-such-compiler")
+        assert not can_be_native()
+        with pytest.raises(
+            RuntimeError, match=r"no C\+\+ compiler \(no-such-compiler\) was found; install one, or leave"
+        ):
+            run_episode(HopperMorph(seed=0), make_policy(HopperMorph(seed=0), num_cells=(8,)), native=True)
+        monkeypatch.setenv("CXX", "false")
+        with pytest.raises(RuntimeError, match=r"native episodes cannot be compiled, leave them out; \S*false -std"):
+            library()
+    finally:
+        library.cache_clear()
+
+
+def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
+    """Names and sizes of all fields, in their order, as the compiler sees them."""
+    source = native_episode.SOURCE.read_text()
+    checks = []
+    for name, structure in (("Layer", native_episode._Layer), ("Episode", native_episode._Episode)):
+        checks.append(f"static_assert(sizeof({name}) == {native_episode.ctypes.sizeof(structure)});")
+        for field, _ in structure._fields_:
+            place = getattr(structure, field)
+            checks.append(f"static_assert(offsetof({name}, {field}) == {place.offset});")
+    assert len(checks) == 2 + 6 + 27
+    file = tmp_path / "check.cpp"
+    file.write_text("#include <cstddef>\n" + source + "\n".join(checks))
+    include = Path(native_episode.mujoco.__file__).parent / "include"
+    done = subprocess.run(
+        [native_episode._compiler(), *native_episode.OPTIONS, f"-I{include}", str(file), "-o", os.devnull],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"enum Ending \{ WHOLE = 0, BROKEN = 1, NOT_FINITE = 2 \};", source)
+    assert (native_episode.BROKEN, native_episode.NOT_FINITE) == (1, 2)
