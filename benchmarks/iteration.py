@@ -13,6 +13,7 @@ from benchmarks.measure import Figure, Target, interleaved, over
 from benchmarks.parts import update_products
 from benchmarks.updates import too_few_cores
 from coim import EpisodeDone, HalfCheetahMorph
+from coim.envs.native_episode import can_be_native
 from coim.experiments.run.build import build
 from coim.experiments.run.machine import available_cores
 from coim.experiments.run.settings import Settings
@@ -95,6 +96,7 @@ class Iterations:
             num_runs=num_runs,
             device=str(device),
             compile=compile,
+            native_episodes=can_be_native(),
         )
         threads = threads or (2 if side_by_side else 1)
         self._events = iter(build(HalfCheetahMorph, settings, threads=threads, side_by_side=side_by_side))

@@ -40,7 +40,10 @@ def traced(algorithm: CoAdaptation, monkeypatch: pytest.MonkeyPatch) -> list[str
 
         monkeypatch.setattr(owner, name, spied)
 
-    def episode(env: Any, policy: Any, *, design: Any, deterministic: bool = False, rng: Any = None) -> str:
+    def episode(
+        env: Any, policy: Any, *, design: Any, native: bool, deterministic: bool = False, rng: Any = None
+    ) -> str:
+        assert not native
         return f"{whose[id(env)]} episode with {'the mode' if deterministic else 'a sample'} of pi_{whose[id(policy)]}"
 
     def mixture(sources: Any, num_batches: int, *, imagined: Any = None, rng: Any = None) -> str:

@@ -6,6 +6,7 @@ camera, and show contacts and forces. Its sliders of joints and motors do not re
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ def live(source: Path, *, design: str, run: int | None, policy: Which | None, bo
     walk = Walk(taken)
     server = viser.ViserServer(host=HOST, port=port, verbose=False)
     print(f"{taken.name}: http://{HOST}:{server.get_port()} in a browser; Ctrl-C ends it", flush=True)
-    Viewer(walk.figure.model, walk.figure.data, step_fn=walk.step, reset_fn=walk.reset, server=server).run()
+    with suppress(KeyboardInterrupt):  # the viewer's loop ends by it, but not while the viewer is being made
+        Viewer(walk.figure.model, walk.figure.data, step_fn=walk.step, reset_fn=walk.reset, server=server).run()
 
 
 class Walk:

@@ -36,7 +36,7 @@ def options(settings: Settings) -> list[str]:
     """Words of a recipe's command line that give these settings, less those that change nothing, which it refuses.
 
     Example:
-        >>> options(Settings(compile=True, seed=3, num_cells=(64, 64)))
+        >>> options(Settings(compile=True, native_episodes=True, seed=3, num_cells=(64, 64)))
         ['--seed', '3', '--num-cells', '64', '64']
     """
     default, idle = PRESETS[settings.preset], without_effect(settings)

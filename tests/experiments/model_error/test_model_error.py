@@ -30,7 +30,7 @@ PROBES = ["seen", "never built", "noisy", "noisy possible", "random", "random po
 OPTIONS = ["--num-designs", "4", "--first-episodes", "2", "--episodes", "2", "--episode-steps", "6", "--num-cells", "8"]
 OPTIONS += ["--individual-updates", "2", "--population-updates", "2", "--model-updates", "2", "--model-cells", "8"]
 OPTIONS += ["--batch-size", "10", "--num-particles", "4", "--num-iterations", "2", "--num-start-states", "3"]
-OPTIONS += ["--threads", "1", "--no-compile", "--quiet"]
+OPTIONS += ["--threads", "1", "--no-compile", "--no-native-episodes", "--quiet"]
 
 
 def measure(folder: Path, *options: str) -> Path:
