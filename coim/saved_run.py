@@ -165,7 +165,10 @@ class SavedRun:
 
     @property
     def acts_natively(self) -> bool:
-        """Whether the run's episodes were native code, where this machine can make it: others round differently."""
+        """Whether the run's episodes were native code, where this machine can make it: others round differently.
+
+        Those of a run that went on with the other kind are taken to be of the newest.
+        """
         return bool(self.settings.get("native_episodes")) and can_be_native()
 
     def _best(self, number: int) -> dict[str, Any]:

@@ -129,8 +129,8 @@ bool within(const double* values, int64_t count, double beyond) {
 
 extern "C" void act(const mjModel* m, mjData* d, int body, void* argument) {
   const Episode& e = *static_cast<const Episode*>(argument);
-  int warned[mjNWARNING];
-  for (int i = 0; i < mjNWARNING; ++i) warned[i] = d->warning[i].number;
+  // From zero, since MuJoCo, when it puts a body back by itself, sets the counter to 1, whatever it was.
+  for (int i = 0; i < mjNWARNING; ++i) d->warning[i].number = 0;
   for (int64_t t = e.next[body]; t < e.steps; ++t) {
     e.next[body] = t;  // an error of MuJoCo leaves from within the step
     const int64_t row = t * e.bodies + body;
@@ -148,7 +148,7 @@ extern "C" void act(const mjModel* m, mjData* d, int body, void* argument) {
     }
     for (int64_t i = 0; i < e.substeps; ++i) e.step(m, d);
     bool works = within(d->qpos, m->nq, e.beyond) && within(d->qvel, m->nv, e.beyond) && within(&d->time, 1, e.beyond);
-    for (int i = 0; i < mjNWARNING; ++i) works = works && d->warning[i].number == warned[i];
+    for (int i = 0; i < mjNWARNING; ++i) works = works && d->warning[i].number == 0;
     e.next[body] = t + 1;
     if (!works) {
       std::copy(seen, seen + e.observed, following);  // the last that is finite

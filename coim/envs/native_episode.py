@@ -1,6 +1,6 @@
 """Whole episodes as native code: ``native_episode.cpp``, made by the C++ compiler that `torch.compile` needs too.
 
-In Python a step of one body takes two to eight times as long as its physics: some thirty calls of torch, numpy and
+In Python a step of one body takes 2.5 to 4.6 times as long as its physics: some thirty calls of torch, numpy and
 MuJoCo, each of a few microseconds. Here the bodies, which do not depend on each other, go through their episode one by
 one, or as many at once as there are threads.
 
@@ -33,7 +33,8 @@ from coim.kept_code import folder
 
 SOURCE = Path(__file__).with_suffix(".cpp")
 # Sums in the order that they are written in, and products that are fused only where the source says so.
-OPTIONS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-shared", "-fPIC")
+OPTIONS = ("-std=c++17", "-O3", "-ffp-contract=off", "-shared", "-fPIC")
+FOR_THIS_PROCESSOR: tuple[list[str], ...] = (["-march=native"], ["-mcpu=native"], [])  # the first that a compiler knows
 BROKEN, NOT_FINITE = 1, 2  # as in the source
 
 
@@ -75,11 +76,28 @@ class Actor:
     design: Tensor
     log_scale_range: tuple[float, float]
 
-    def is_plain(self) -> bool:
-        """Whether all numbers are finite, in float32 and on the CPU: others act in Python, which says what is wrong."""
+    def fits(self, env: MorphEnv) -> bool:
+        """Whether the sizes are those of the bodies, and all numbers finite, in float32 and on the CPU.
+
+        Others act in Python, which says what is wrong with them.
+        """
+        runs, acted = env.action_spec.shape
+        observed = env.observation_spec["observation"].shape[-1]
         tensors = [self.observation_scale, self.design, *(tensor for layer in self.layers for tensor in layer)]
-        kinds = {(tensor.dtype, tensor.device.type) for tensor in tensors}
-        return kinds == {(torch.float32, "cpu")} and all(bool(tensor.isfinite().all()) for tensor in tensors)
+        if {(tensor.dtype, tensor.device.type) for tensor in tensors} != {(torch.float32, "cpu")}:
+            return False
+        sizes = [observed + self.design.shape[-1], *(bias.shape[-1] for _, bias in self.layers)]
+        own = [runs] if self.layers[0][0].dim() == 3 else []
+        return (
+            self.observation_scale.shape == (observed,)
+            and self.design.shape == env.state_spec["design"].shape
+            and sizes[-1] == 2 * acted
+            and all(
+                [*weight.shape] == [*own, inputs, outputs] and [*bias.shape] == [*own, outputs]
+                for (weight, bias), inputs, outputs in zip(self.layers, sizes[:-1], sizes[1:])
+            )
+            and all(bool(tensor.isfinite().all()) for tensor in tensors)
+        )
 
 
 @dataclass(frozen=True)
@@ -111,7 +129,7 @@ def play(env: MorphEnv, actor: Actor, noise: Tensor | None, rows: Rows) -> None:
         rows: to be written to, with ``broken`` all False.
 
     Raises:
-        ValueError: if an action is not finite.
+        ValueError: if an action is not finite; other bodies may have moved on to their last step.
         RuntimeError: if the code cannot be compiled.
     """
     steps, bodies = rows.broken.shape[:2]
@@ -173,16 +191,16 @@ def play(env: MorphEnv, actor: Actor, noise: Tensor | None, rows: Rows) -> None:
             at = int(upcoming[row])
             rows.following[at, row] = rows.observation[at, row]
             upcoming[row], ending[row] = at + 1, BROKEN
-        env.have_moved(to_go, upcoming - before)
-        if (ending == NOT_FINITE).any():
-            row = int((ending == NOT_FINITE).nonzero()[0])
-            raise not_finite(rows.action[upcoming[row], row])
         broken = (ending == BROKEN).numpy()
-        rows.broken[upcoming.numpy()[broken] - 1, np.flatnonzero(broken)] = True
+        env.have_moved(to_go[~broken[to_go]], upcoming - before)
         if broken.any():
+            rows.broken[upcoming.numpy()[broken] - 1, np.flatnonzero(broken)] = True
             env.num_broken += torch.from_numpy(broken)
             again = torch.from_numpy(broken).unsqueeze(-1)
             env.reset(TensorDict({"_reset": again}, env.batch_size, device=env.device))
+        if (ending == NOT_FINITE).any():
+            row = int((ending == NOT_FINITE).nonzero()[0])
+            raise not_finite(rows.action[upcoming[row], row])
         to_go = np.flatnonzero(broken & (upcoming < steps).numpy())
 
 
@@ -190,7 +208,7 @@ def can_be_native() -> bool:
     """Whether there is native code of episodes on this machine, or it can be made."""
     try:
         library()
-    except (RuntimeError, OSError):
+    except RuntimeError:
         return False
     return True
 
@@ -200,25 +218,29 @@ def library() -> ctypes.CDLL:
     """The compiled source, of an earlier process or made now.
 
     Raises:
-        RuntimeError: if there is no compiler, or it cannot compile the source; the message has its words.
+        RuntimeError: if there is no compiler, it cannot compile the source, or what it makes cannot be kept or loaded;
+            the message has its words.
     """
     compiler = _compiler()
     include = Path(mujoco.__file__).parent / "include"
     # What the compiler predefines names its version and what the processor can do: a home folder may serve others.
-    predefined = _run([compiler, *OPTIONS, "-dM", "-E", "-x", "c++", os.devnull])
-    parts = (SOURCE.read_text(), predefined, mujoco.__version__, repr(OPTIONS))
+    options, predefined = _options(compiler)
+    parts = (SOURCE.read_text(), predefined, mujoco.__version__, repr(options))
     path = folder() / f"episode-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.so"
     if path.exists():
         try:
             return ctypes.CDLL(str(path))
         except OSError:  # half a file
             pass
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as beside:
-        made = Path(beside) / path.name
-        _run([compiler, *OPTIONS, f"-I{include}", str(SOURCE), "-o", str(made)])
-        os.replace(made, path)
-    return ctypes.CDLL(str(path))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as beside:
+            made = Path(beside) / path.name
+            _run([compiler, *options, f"-I{include}", str(SOURCE), "-o", str(made)])
+            os.replace(made, path)
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        raise RuntimeError(f"native episodes cannot be kept in {path.parent}, leave them out: {error}") from error
 
 
 def _compiler() -> str:
@@ -232,10 +254,23 @@ def _compiler() -> str:
     )
 
 
+def _options(compiler: str) -> tuple[list[str], str]:
+    """Options of the compiler on this processor, and what it predefines with them."""
+    refused: RuntimeError | None = None
+    for more in FOR_THIS_PROCESSOR:
+        try:
+            return [*OPTIONS, *more], _run([compiler, *OPTIONS, *more, "-dM", "-E", "-x", "c++", os.devnull])
+        except RuntimeError as error:
+            refused = refused or error
+    raise refused or RuntimeError
+
+
 def _run(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    except OSError as error:  # a file that is no program
+        raise RuntimeError(f"native episodes cannot be compiled, leave them out; {command[0]}: {error}") from error
     if done.returncode:
-        raise RuntimeError(
-            f"native episodes cannot be compiled, leave them out; {' '.join(command)}: {done.stderr[-2000:]}"
-        )
+        said = done.stderr[-2000:] or f"it ended with {done.returncode}"
+        raise RuntimeError(f"native episodes cannot be compiled, leave them out; {' '.join(command)}: {said}")
     return done.stdout

@@ -33,6 +33,7 @@ from coim.experiments.run.last_words import last_words
 from coim.experiments.run.machine import (
     available_cores,
     check_compiler,
+    check_native_episodes,
     checked_device,
     folder_of_compiled_code,
     prepare,
@@ -93,6 +94,8 @@ def train(
     products = begin_or_resume(name, settings)
     if needing := [name for name in ("compile", "native_episodes") if getattr(settings, name)]:
         check_compiler(without=" ".join(option(f"no_{name}") for name in needing))
+    if settings.native_episodes:
+        check_native_episodes()
     with folder_of(name, settings) as folder:
         algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:

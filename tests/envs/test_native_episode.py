@@ -30,6 +30,7 @@ from coim import (
 from coim.buffers import ROW_KEYS
 from coim.envs import native_episode
 from coim.envs.native_episode import can_be_native, library
+from coim.models import PolicyNetwork
 
 STEPS = 60
 ARM = """
@@ -70,7 +71,8 @@ def natively_and_replayed(
     rows = [run_episode(native, policy, design=design, deterministic=deterministic, rng=rng(), native=True)]
     others = [replayed(again, rows[0]["action"], design)]
     assert same_state(native, again)
-    rows.append(run_episode(native, policy, deterministic=deterministic, rng=rng(), native=True))
+    design = design.flip(0)  # other bodies after the first native episode
+    rows.append(run_episode(native, policy, design=design, deterministic=deterministic, rng=rng(), native=True))
     others.append(replayed(again, rows[1]["action"], design))
     assert same_state(native, again)
     return torch.cat(rows), torch.cat(others)
@@ -141,6 +143,30 @@ def test_a_body_that_breaks_starts_again_while_the_others_go_on(monkeypatch: pyt
         assert torch.equal(rows[key], again[key]), key
 
 
+@pytest.mark.parametrize("body", [HopperMorph, HalfCheetahMorph])
+def test_every_warning_of_mujoco_breaks_a_body_also_one_that_it_gave_before(body: type[MorphEnv]) -> None:
+    """Bodies that start with a hundred times what physics can bear, which MuJoCo puts back by itself."""
+    make = lambda: body(num_runs=3, seed=0, episode_steps=STEPS, reset_noise=100.0)  # noqa: E731
+    design = torch.ones(3, body.DESIGN_SIZE)
+    rows, again = natively_and_replayed(make, make_policy(make(), num_cells=(8,)), design)
+    assert rows["next", "terminated"].sum(0).max() > 1
+    for key in ROW_KEYS:
+        assert torch.equal(rows[key], again[key]), key
+
+
+@pytest.mark.parametrize("limit", [1e-9, 0.3, 0.05])
+def test_a_body_is_broken_where_time_positions_or_velocities_are_beyond_physics(
+    limit: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit that time exceeds first, one that only velocities do, and one that positions do too, from rest."""
+    for module in ("native_episode", "simulation"):
+        monkeypatch.setattr(f"coim.envs.{module}.BEYOND_PHYSICS", limit)
+    make = lambda: HopperMorph(num_runs=2, seed=0, episode_steps=STEPS)  # noqa: E731
+    rows, again = natively_and_replayed(make, make_policy(make(), num_cells=(8,)), torch.ones(2, 4))
+    assert rows["next", "terminated"].any()
+    assert torch.equal(rows["next", "terminated"], again["next", "terminated"])
+
+
 def test_an_error_of_mujoco_within_an_episode_breaks_the_body_and_writes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -177,6 +203,54 @@ def test_an_action_that_is_not_finite_is_refused_as_in_python(weight: float) -> 
     assert (env.num_broken == 0).all()
 
 
+@pytest.mark.parametrize("lies", ["in a flat buffer", "transposed"])
+def test_weights_are_read_wherever_they_lie(lies: str) -> None:
+    """As a learner lays them: one buffer for all of a run's weights, the next run's after it."""
+    one, other = (HopperMorph(num_runs=3, seed=0, episode_steps=STEPS) for _ in range(2))
+    policy = make_policy(one, num_cells=(7, 5), num_runs=3)
+    expected = run_episode(one, policy, rng=rng(), native=True)
+    parameters = [*policy.parameters()]
+    flat = torch.cat([parameter.detach().flatten(1) for parameter in parameters], 1)
+    parts = flat.split([parameter[0].numel() for parameter in parameters], 1)
+    for parameter, part in zip(parameters, parts):
+        if lies == "transposed":
+            parameter.data = parameter.data.mT.contiguous().mT if parameter.dim() == 3 else parameter.data
+        else:
+            parameter.data = part.view(parameter.shape)
+    assert (run_episode(other, policy, rng=rng(), native=True) == expected).all()
+
+
+@pytest.mark.parametrize("bias", [-30.0, 9.0])
+def test_the_log_scale_is_clamped(bias: float) -> None:
+    env = HopperMorph(seed=0, episode_steps=STEPS)
+    policy = make_policy(env, num_cells=(8,))
+    with torch.no_grad():
+        policy.network.mlp.layers[-1].bias[3:] = bias
+    rows = run_episode(env, policy, rng=rng(), native=True)
+    with torch.no_grad():
+        loc, scale = policy.network(rows["observation"], rows["design"])
+    torch.testing.assert_close(rows["action"], (loc + scale * noise_of((1, 3))).tanh(), rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("policy", "runs"),
+    [
+        (lambda env: make_policy(env, num_cells=(8,), num_runs=1), 3),
+        (lambda env: make_policy(env, num_cells=(8,), num_runs=3), 5),
+        (lambda env: make_policy(env, num_cells=(8,), num_runs=5), 3),
+        (lambda env: Policy(PolicyNetwork(11, 4, 5, num_cells=(8,))), 3),
+        (lambda env: Policy(PolicyNetwork(5, 4, 3, num_cells=(8,))), 3),
+        (lambda env: Policy(PolicyNetwork(2, 4, 1, num_cells=(2,))), 64),
+    ],
+    ids=["one run of three", "three of five", "five of three", "actions", "observations", "both"],
+)
+def test_a_policy_of_other_sizes_is_refused_as_in_python(policy: Callable[[MorphEnv], Policy], runs: int) -> None:
+    env = HopperMorph(num_runs=runs, seed=0, episode_steps=5)
+    for native in (False, True):
+        with pytest.raises(RuntimeError, match=r"size|shape|expand"):
+            run_episode(env, policy(env), native=native)
+
+
 def test_bodies_that_move_in_a_way_of_their_own_and_altered_policies_act_in_python() -> None:
     class Watched(HopperMorph):
         moves = 0
@@ -190,6 +264,12 @@ def test_bodies_that_move_in_a_way_of_their_own_and_altered_policies_act_in_pyth
     rows = run_episode(env, policy, rng=rng(), native=True)
     assert env.moves == 5
     assert (rows == run_episode(plain, policy, rng=rng())).all()
+
+    moves = []
+    watched = HopperMorph(seed=0, episode_steps=5)
+    watched.move = lambda action: (moves.append(1), HopperMorph.move(watched, action))[1]
+    run_episode(watched, policy, native=True)
+    assert len(moves) == 5
 
     hooked = deepcopy(policy)
     hooked.network.mlp.layers[0].register_forward_hook(lambda module, given, out: -out)
@@ -231,7 +311,9 @@ def test_code_is_made_once_for_all_processes_and_anew_if_it_is_damaged(
     assert damaged.stat().st_size == made.stat().st_size
 
 
-def test_without_a_compiler_or_with_one_that_fails_a_sentence_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_or_with_one_that_fails_a_sentence_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     library.cache_clear()
     try:
         monkeypatch.setenv("CXX", "no-such-compiler")
@@ -240,11 +322,30 @@ def test_without_a_compiler_or_with_one_that_fails_a_sentence_says_so(monkeypatc
             RuntimeError, match=r"no C\+\+ compiler \(no-such-compiler\) was found; install one, or leave"
         ):
             run_episode(HopperMorph(seed=0), make_policy(HopperMorph(seed=0), num_cells=(8,)), native=True)
+        (tmp_path / "broken").write_bytes(b"\0")
+        (tmp_path / "broken").chmod(0o755)
+        monkeypatch.setenv("CXX", str(tmp_path / "broken"))
+        assert not can_be_native()
         monkeypatch.setenv("CXX", "false")
         with pytest.raises(RuntimeError, match=r"native episodes cannot be compiled, leave them out; \S*false -std"):
             library()
     finally:
         library.cache_clear()
+
+
+def test_a_compiler_that_does_not_know_the_processor_compiles_for_any(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler = tmp_path / "c++"
+    compiler.write_text(
+        '#!/bin/sh\nfor word; do case $word in -m*=native) echo "unknown $word" >&2; exit 1;; esac; done\n'
+        f'exec {native_episode._compiler()} "$@"\n'
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    assert hasattr(library.__wrapped__(), "act")
+    assert native_episode._options(str(compiler))[0] == [*native_episode.OPTIONS]
 
 
 def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
@@ -260,10 +361,10 @@ def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
     file = tmp_path / "check.cpp"
     file.write_text("#include <cstddef>\n" + source + "\n".join(checks))
     include = Path(native_episode.mujoco.__file__).parent / "include"
+    compiler = native_episode._compiler()
+    options = native_episode._options(compiler)[0]
     done = subprocess.run(
-        [native_episode._compiler(), *native_episode.OPTIONS, f"-I{include}", str(file), "-o", os.devnull],
-        capture_output=True,
-        text=True,
+        [compiler, *options, f"-I{include}", str(file), "-o", os.devnull], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert re.search(r"enum Ending \{ WHOLE = 0, BROKEN = 1, NOT_FINITE = 2 \};", source)

@@ -123,11 +123,11 @@ def gpu() -> Finding:
 
 
 def compiler() -> Finding:
-    """The C++ compiler of ``--compile``."""
+    """The C++ compiler of ``--compile`` and ``--native-episodes``."""
     try:
         check_compiler()
     except ValueError as error:
-        return Finding("compiler", "none that can be used", f"{error}; updates take longer then")
+        return Finding("compiler", "none that can be used", f"{error}; updates and episodes take longer then")
     return Finding("compiler", f"found; compiled code goes to {folder_of_compiled_code()}")
 
 

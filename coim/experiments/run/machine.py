@@ -12,6 +12,8 @@ from pathlib import Path
 
 import torch
 
+from coim.envs.native_episode import library
+from coim.experiments.run.atomic_write import says_full
 from coim.products import Choice, Library, Named, use
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -55,6 +57,21 @@ def check_compiler(without: str = "--no-compile --no-native-episodes") -> None:
             f"compiled code is put into {folder} and loaded from there, which {why}; name another folder by the "
             f"environment variable TORCHINDUCTOR_CACHE_DIR, or {without}"
         )
+
+
+def check_native_episodes() -> None:
+    """Compile native episodes, or find what an earlier process has compiled.
+
+    Raises:
+        ValueError: if they cannot be compiled; the message has the compiler's words.
+        OSError: if the disk is full.
+    """
+    try:
+        library()
+    except RuntimeError as error:
+        if says_full(error):
+            raise OSError(f"disk full: {error}; make room there, or --no-native-episodes") from error
+        raise ValueError(f"{error} (--no-native-episodes)") from error
 
 
 def folder_of_compiled_code() -> Path:

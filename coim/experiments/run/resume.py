@@ -136,6 +136,8 @@ def resumed(settings: Settings, folder: Path) -> Settings | None:
     saved = saved_settings(folder)
     # A study may have been moved, or given another name.
     going_on = dataclasses.replace(settings, out=saved.out, name=saved.name, resume=folder)
+    # Protocols have native episodes that had none when a cell was begun, which goes on with the numbers of its past.
+    going_on = dataclasses.replace(going_on, native_episodes=settings.native_episodes and saved.native_episodes)
     refuse_changes(saved, going_on)
     return going_on
 

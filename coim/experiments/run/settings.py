@@ -150,8 +150,8 @@ class Settings:
     compile: bool = False
     """Compile the gradients with torch.compile: up to a minute at the first start, then faster. On in both presets."""
     native_episodes: bool = False
-    """Run episodes in native code, which a C++ compiler makes in a second: a third to an eighth of the time. On in both
-    presets; actions differ by roundings."""
+    """Run episodes in native code, which a C++ compiler makes in a second: a third to a seventh of the time for one
+    body. On in both presets; actions differ by roundings."""
     device: str = "cpu"
     """Device of the networks: cpu, cuda, cuda:1, ..."""
     replay_device: Literal["same", "cpu"] = "same"

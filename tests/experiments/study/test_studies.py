@@ -341,6 +341,21 @@ def test_a_cell_goes_on_where_it_was_cut_and_logs_each_try(tmp_path: Path) -> No
     assert json.loads((folder / "config.json").read_text())["resumed"][0]["changed"] == {}
 
 
+def test_a_cell_that_was_begun_with_episodes_in_python_goes_on_with_them(tmp_path: Path) -> None:
+    cut(tmp_path / "python", 3)
+    asked = dataclasses.replace(TINY, native_episodes=True)
+    config = tmp_path / "python" / "config.json"
+    assert not to_go_on(dataclasses.replace(asked, out=tmp_path / "python")).native_episodes
+    written = json.loads(config.read_text())
+    del written["settings"]["native_episodes"]  # of a version that had none
+    config.write_text(json.dumps(written))
+    assert not to_go_on(dataclasses.replace(asked, out=tmp_path / "python")).native_episodes
+    written["settings"]["native_episodes"] = True
+    config.write_text(json.dumps(written))
+    assert to_go_on(dataclasses.replace(asked, out=tmp_path / "python")).native_episodes
+    assert not to_go_on(dataclasses.replace(TINY, out=tmp_path / "python")).native_episodes
+
+
 def all_episodes_of(settings: Settings) -> int:
     return all_episodes(dataclasses.replace(study().cells()[0], settings=settings))
 
