@@ -34,7 +34,7 @@ struct Episode {
   int64_t unseen, angles, layers, width;          // positions that are not observed; counts; units of the widest layer
   const int64_t* angle;                           // observed entries that are wrapped
   const double *middle, *reach;                   // of each motor's range, or null where it is [-1, 1]
-  double beyond;                                  // no position, velocity or time of a working body is so large
+  double beyond;                                  // no position or velocity of a working body is so large
   const Layer* layer;
   const float *scale, *design, *noise;            // [S]; [K, D], as the network reads them; [T, K, A], null for the mode
   float least, most;                              // range of the log-scale
@@ -147,7 +147,7 @@ extern "C" void act(const mjModel* m, mjData* d, int body, void* argument) {
       d->ctrl[i] = e.reach ? e.middle[i] + e.reach[i] * torque : torque;
     }
     for (int64_t i = 0; i < e.substeps; ++i) e.step(m, d);
-    bool works = within(d->qpos, m->nq, e.beyond) && within(d->qvel, m->nv, e.beyond) && within(&d->time, 1, e.beyond);
+    bool works = within(d->qpos, m->nq, e.beyond) && within(d->qvel, m->nv, e.beyond);
     for (int i = 0; i < mjNWARNING; ++i) works = works && d->warning[i].number == 0;
     e.next[body] = t + 1;
     if (!works) {

@@ -154,17 +154,20 @@ def test_every_warning_of_mujoco_breaks_a_body_also_one_that_it_gave_before(body
         assert torch.equal(rows[key], again[key]), key
 
 
-@pytest.mark.parametrize("limit", [1e-9, 0.3, 0.05])
-def test_a_body_is_broken_where_time_positions_or_velocities_are_beyond_physics(
+@pytest.mark.parametrize("limit", [1.3, 2.0])
+def test_a_body_is_broken_where_positions_or_velocities_are_beyond_physics(
     limit: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A limit that time exceeds first, one that only velocities do, and one that positions do too, from rest."""
+    """A hopper stands 1.25 m high; it moves slowly at first."""
     for module in ("native_episode", "simulation"):
         monkeypatch.setattr(f"coim.envs.{module}.BEYOND_PHYSICS", limit)
     make = lambda: HopperMorph(num_runs=2, seed=0, episode_steps=STEPS)  # noqa: E731
-    rows, again = natively_and_replayed(make, make_policy(make(), num_cells=(8,)), torch.ones(2, 4))
-    assert rows["next", "terminated"].any()
-    assert torch.equal(rows["next", "terminated"], again["next", "terminated"])
+    rows, again = natively_and_replayed(
+        make, make_policy(make(), num_cells=(8,)), torch.tensor([[1.0] * 4, [1.04] * 4])
+    )
+    assert 0 < rows["next", "terminated"].float().mean() < 1
+    for key in ROW_KEYS:
+        assert torch.equal(rows[key], again[key]), key
 
 
 def test_an_error_of_mujoco_within_an_episode_breaks_the_body_and_writes_nothing(
