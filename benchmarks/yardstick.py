@@ -34,6 +34,8 @@ from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import prepare
 from coim.experiments.run.provenance import git_revision
 from coim.experiments.statistics.predicted import spearman, spearman_given
+from coim.experiments.statistics.retrained import results
+from coim.experiments.study.runs import CHOSEN
 from coim.run_folder import DESIGNS
 from coim.tables import DESIGN_PREFIX, design_columns
 
@@ -83,9 +85,9 @@ def tried(study: Path, environment: str) -> pd.DataFrame:
         table = read_frame(folder / DESIGNS.file, DESIGNS)
         found.append(table.assign(arm=arm, seed=int(seed))[table["run"] == 0])
     bodies = pd.concat(found).drop(columns=["run", "predicted", "diverged"], errors="ignore")
-    path = study / "figure_2_retrained.csv"
-    if path.exists():
-        retrained = pd.read_csv(path).query("environment == @environment")
+    listed = study / "retrained" / CHOSEN.file
+    if listed.exists():
+        retrained, _ = results(listed.parent, read_frame(listed, CHOSEN).query("environment == @environment"))
         at = retrained.set_index(["arm", "seed", "design"])["best_return"].rename("retrained")
         bodies = bodies.join(at, on=["arm", "seed", "design"])
     return bodies

@@ -21,7 +21,7 @@ def test_bodies_earn_what_the_population_earns_on_them_each_alone(tmp_path: Path
     study = tmp_path / "study"
     for name in ("hopper-forward-grounded-20", "hopper-forward-none-21"):
         shutil.copytree(STUDY / "cells" / name, study / "cells" / name)
-    shutil.copy(STUDY / "figure_2_retrained.csv", study)
+    shutil.copytree(STUDY / "retrained", study / "retrained")
     main(Measured(run=folder, study=study, out=tmp_path / "out", num_bodies=5, episodes=2))
     bodies = pd.read_csv(tmp_path / "out" / "bodies.csv")
     assert (bodies["arm"] == "uniform").sum() == 5
