@@ -13,6 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from test_other_robots import ARM
 from torch import Tensor
 
 from coim import (
@@ -33,19 +34,6 @@ from coim.envs.native_episode import can_be_native, library
 from coim.models import PolicyNetwork
 
 STEPS = 60
-ARM = """
-<mujoco><option timestep=".01"/>
-  <worldbody><body name="upper">
-    <joint name="shoulder" axis="0 0 1" damping=".1"/>
-    <geom name="upper" type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>
-    <body name="lower" pos=".5 0 0">
-      <joint name="elbow" axis="0 0 1" range="-150 150" damping=".1"/>
-      <geom name="lower" type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
-    </body>
-  </body></worldbody>
-  <actuator><motor joint="shoulder" gear="5" ctrlrange="-2 2"/><motor joint="elbow" ctrlrange="0 3"/></actuator>
-</mujoco>
-"""
 
 
 def rng() -> torch.Generator:
