@@ -29,7 +29,7 @@ struct Layer {
 
 struct Episode {
   void (*step)(const mjModel*, mjData*);
-  int64_t bodies, steps, substeps;                // K, T, steps of MuJoCo in one of ours
+  int64_t bodies, steps, substeps;                // K; before which step to stop; steps of MuJoCo in one of ours
   int64_t observed, designed, acted;              // S, D, A
   int64_t unseen, angles, layers, width;          // positions that are not observed; counts; units of the widest layer
   const int64_t* angle;                           // observed entries that are wrapped

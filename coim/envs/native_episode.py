@@ -36,6 +36,7 @@ SOURCE = Path(__file__).with_suffix(".cpp")
 OPTIONS = ("-std=c++17", "-O3", "-ffp-contract=off", "-shared", "-fPIC")
 FOR_THIS_PROCESSOR: tuple[list[str], ...] = (["-march=native"], ["-mcpu=native"], [])  # the first that a compiler knows
 BROKEN, NOT_FINITE = 1, 2  # as in the source
+AT_ONCE = 5_000  # steps of all bodies in a call, about half a second: only between calls does Python hear Ctrl-C
 
 
 class _Layer(ctypes.Structure):
@@ -156,7 +157,7 @@ def play(env: MorphEnv, actor: Actor, noise: Tensor | None, rows: Rows) -> None:
     episode = _Episode(
         step=ctypes.cast(mujoco_library().mj_step, ctypes.c_void_p),
         bodies=bodies,
-        steps=steps,
+        steps=0,  # so far in this call
         substeps=env.FRAME_SKIP,
         observed=rows.observation.shape[-1],
         designed=actor.design.shape[-1],
@@ -185,6 +186,7 @@ def play(env: MorphEnv, actor: Actor, noise: Tensor | None, rows: Rows) -> None:
     to_go = np.arange(bodies)
     while to_go.size:
         before = upcoming.clone()
+        episode.steps = min(steps, int(upcoming[to_go].min()) + max(1, AT_ONCE // len(to_go)))
         ending.zero_()
         failed = env.simulations.apply(library().act, ctypes.byref(episode), to_go)
         for row in failed:  # MuJoCo raised within a step: it is the last one, and leads nowhere
@@ -201,7 +203,7 @@ def play(env: MorphEnv, actor: Actor, noise: Tensor | None, rows: Rows) -> None:
         if (ending == NOT_FINITE).any():
             row = int((ending == NOT_FINITE).nonzero()[0])
             raise not_finite(rows.action[upcoming[row], row])
-        to_go = np.flatnonzero(broken & (upcoming < steps).numpy())
+        to_go = np.flatnonzero((upcoming < steps).numpy())
 
 
 def can_be_native() -> bool:

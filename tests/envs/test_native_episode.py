@@ -116,10 +116,12 @@ def test_one_body_acts_as_it_does_in_a_fleet_and_with_any_number_of_threads() ->
     assert (own == rows[:, 1:2]).all()
 
 
-def test_a_body_that_breaks_starts_again_while_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What counts as broken is set so low that hopping does it, now and then."""
+@pytest.mark.parametrize("at_once", [1, 30, 5_000])
+def test_a_body_that_breaks_starts_again_while_the_others_go_on(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What counts as broken is set so low that hopping does it, now and then; an episode may take many calls."""
     for module in ("native_episode", "simulation"):
         monkeypatch.setattr(f"coim.envs.{module}.BEYOND_PHYSICS", 5.0)
+    monkeypatch.setattr(native_episode, "AT_ONCE", at_once)
     env = HopperMorph(num_runs=4, seed=0, episode_steps=STEPS)
     policy = make_policy(env, num_cells=(8,), num_runs=4)
     make = lambda: HopperMorph(num_runs=4, seed=0, episode_steps=STEPS)  # noqa: E731
@@ -240,6 +242,23 @@ def test_a_policy_of_other_sizes_is_refused_as_in_python(policy: Callable[[Morph
     for native in (False, True):
         with pytest.raises(RuntimeError, match=r"size|shape|expand"):
             run_episode(env, policy(env), native=native)
+
+
+def test_a_long_episode_is_left_between_its_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = HopperMorph(num_runs=2, seed=0, episode_steps=STEPS)
+    calls, apply = [], type(env.simulations).apply
+
+    def interrupted(*given: object) -> object:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return apply(*given)
+
+    monkeypatch.setattr(type(env.simulations), "apply", interrupted)
+    monkeypatch.setattr(native_episode, "AT_ONCE", 20)
+    with pytest.raises(KeyboardInterrupt):
+        run_episode(env, make_policy(env, num_cells=(8,)), native=True)
+    assert env._step_count.flatten().tolist() == [20, 20]
 
 
 def test_bodies_that_move_in_a_way_of_their_own_and_altered_policies_act_in_python() -> None:
