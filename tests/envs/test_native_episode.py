@@ -13,8 +13,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from test_other_robots import ARM
 from torch import Tensor
+from two_link_arm import TWO_LINK_ARM
 
 from coim import (
     AntMorph,
@@ -69,7 +69,7 @@ def natively_and_replayed(
 def arm(tmp_path: Path) -> type[MorphEnv]:
     """A robot on a fixed base, whose motors have ranges of their own and whose shoulder turns for ever."""
     file = tmp_path / "arm.xml"
-    file.write_text(ARM)
+    file.write_text(TWO_LINK_ARM)
     return morph_from_mjcf(file, scale={"upper": ["upper"], "lower": ["lower"]}, reward=still)
 
 

@@ -13,24 +13,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import check_env_specs
+from two_link_arm import TWO_LINK_ARM
 
 from coim.envs import MorphEnv, SimulatorDynamics, WorldModelEnv
 from coim.envs.simulation import lowest_point
 from coim.models import GaussianEnsemble
 
-ARM = """
-<mujoco><option timestep=".01"/>
-  <worldbody><body name="upper">
-    <joint name="shoulder" axis="0 0 1" damping=".1"/>
-    <geom name="upper" type="capsule" fromto="0 0 0 .5 0 0" size=".03"/>
-    <body name="lower" pos=".5 0 0">
-      <joint name="elbow" axis="0 0 1" range="-150 150" damping=".1"/>
-      <geom name="lower" type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
-    </body>
-  </body></worldbody>
-  <actuator><motor joint="shoulder" gear="5" ctrlrange="-2 2"/><motor joint="elbow" ctrlrange="0 3"/></actuator>
-</mujoco>
-"""
 DRONE = """
 <mujoco><option timestep=".005"/>
   <worldbody><body name="hub" pos="0 0 .3">
@@ -86,7 +74,7 @@ class Drone(Stretched):
 @pytest.fixture(scope="module", autouse=True)
 def files(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder: Path = tmp_path_factory.mktemp("robots")
-    for body, text in ((Arm, ARM), (Drone, DRONE)):
+    for body, text in ((Arm, TWO_LINK_ARM), (Drone, DRONE)):
         body.ASSET = str(folder / f"{body.__name__}.xml")
         Path(body.ASSET).write_text(text)
 
