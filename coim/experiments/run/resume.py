@@ -136,8 +136,7 @@ def resumed(settings: Settings, folder: Path) -> Settings | None:
     saved = saved_settings(folder)
     # A study may have been moved, or given another name.
     going_on = dataclasses.replace(settings, out=saved.out, name=saved.name, resume=folder)
-    # Protocols have native episodes that had none when a cell was begun, which goes on with the numbers of its past.
-    going_on = dataclasses.replace(going_on, native_episodes=settings.native_episodes and saved.native_episodes)
+    going_on = with_episodes_as_begun(going_on, in_native_code=saved.native_episodes)
     refuse_changes(saved, going_on)
     return going_on
 
@@ -153,7 +152,9 @@ def still_finished(settings: Settings, folder: Path) -> bool:
     """
     if not (folder / "config.json").exists():
         return False
-    saved, asked = read_config(folder)["settings"], json.loads(json.dumps(plain(settings)))
+    saved = read_config(folder)["settings"]
+    settings = with_episodes_as_begun(settings, in_native_code=saved.get("native_episodes", False))
+    asked = json.loads(json.dumps(plain(settings)))
     more = asked["num_designs"] > saved["num_designs"]
     fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})
     # A protocol may have changed in what this arm does not read: the size of a model that a model-free run has not.
@@ -164,6 +165,11 @@ def still_finished(settings: Settings, folder: Path) -> bool:
             f"the run in {folder} was made with other settings: {told}; leave them, or take another folder"
         )
     return not more
+
+
+def with_episodes_as_begun(settings: Settings, *, in_native_code: bool) -> Settings:
+    """What a study asks of a cell that was begun when its protocol had no native episodes: the numbers of its past."""
+    return dataclasses.replace(settings, native_episodes=settings.native_episodes and in_native_code)
 
 
 def saved_settings(folder: Path) -> Settings:

@@ -15,7 +15,7 @@ from coim import EpisodeDone, HopperMorph
 from coim.envs import BODIES
 from coim.experiments.commands.study import main as entry
 from coim.experiments.run.build import build
-from coim.experiments.run.resume import to_go_on
+from coim.experiments.run.resume import still_finished, to_go_on
 from coim.experiments.run.settings import METHODS, Settings, plain
 from coim.experiments.study.arms import ARMS
 from coim.experiments.study.cell import compute, episodes_done, seconds_of, tries
@@ -354,6 +354,23 @@ def test_a_cell_that_was_begun_with_episodes_in_python_goes_on_with_them(tmp_pat
     config.write_text(json.dumps(written))
     assert to_go_on(dataclasses.replace(asked, out=tmp_path / "python")).native_episodes
     assert not to_go_on(dataclasses.replace(TINY, out=tmp_path / "python")).native_episodes
+
+
+@pytest.mark.parametrize("written", [{}, {"native_episodes": False}, {"native_episodes": True}])
+def test_a_cell_with_episodes_in_python_is_finished_for_a_protocol_that_has_native_ones(
+    tmp_path: Path, written: dict[str, bool]
+) -> None:
+    """Resuming writes all settings down, also one that the version it was begun with had not."""
+    config = tmp_path / "config.json"
+    settings = plain(TINY)
+    del settings["native_episodes"]
+    config.write_text(json.dumps({"environment": "hopper", "settings": settings | written}))
+    assert still_finished(dataclasses.replace(TINY, native_episodes=True), tmp_path)
+    if written.get("native_episodes"):
+        with pytest.raises(ValueError, match=r"native_episodes \(True to False\)"):
+            still_finished(TINY, tmp_path)
+    else:
+        assert still_finished(TINY, tmp_path)
 
 
 def all_episodes_of(settings: Settings) -> int:
