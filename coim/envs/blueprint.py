@@ -53,7 +53,7 @@ def observed(robot: MorphEnv) -> list[tuple[str, str]]:
     model = robot.simulations.model(0)
     positions, velocities = [], []
     for joint in range(model.njnt):
-        where, speed = _entries(model.joint(joint).name, mujoco.mjtJoint(int(model.jnt_type[joint])))
+        where, speed = _entries(_called(model, joint), mujoco.mjtJoint(int(model.jnt_type[joint])))
         positions += where
         velocities += speed
     unseen = model.nq + model.nv - robot.observation_spec["observation"].shape[-1]
@@ -61,6 +61,11 @@ def observed(robot: MorphEnv) -> list[tuple[str, str]]:
     for angle in robot.angle_indices:
         named[angle] = (f"{named[angle][0]}, wrapped to (-pi, pi]", named[angle][1])
     return named
+
+
+def _called(model: mujoco.MjModel, joint: int) -> str:
+    """The name of a joint, or of what it moves, where the file has none."""
+    return model.joint(joint).name or model.body(model.jnt_bodyid[joint]).name or f"joint {joint}"
 
 
 def _entries(name: str, kind: mujoco.mjtJoint) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
@@ -84,4 +89,4 @@ def motors(robot: MorphEnv) -> Iterator[tuple[str, float, float, str]]:
         joint = model.actuator_trnid[motor, 0]
         low, high = (float(end) for end in model.actuator_ctrlrange[motor] * model.actuator_gear[motor, 0])
         slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-        yield model.joint(joint).name, low, high, "N" if slides else "N m"
+        yield _called(model, joint), low, high, "N" if slides else "N m"

@@ -33,6 +33,7 @@ from coim.experiments.run.last_words import last_words
 from coim.experiments.run.machine import (
     available_cores,
     check_compiler,
+    check_logger,
     check_native_episodes,
     checked_device,
     folder_of_compiled_code,
@@ -96,6 +97,7 @@ def train(
         check_compiler(without=" ".join(option(f"no_{name}") for name in needing))
     if settings.native_episodes:
         check_native_episodes()
+    check_logger(settings.log)
     with folder_of(name, settings) as folder:
         algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:

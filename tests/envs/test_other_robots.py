@@ -16,6 +16,7 @@ from torchrl.envs import check_env_specs
 from two_link_arm import TWO_LINK_ARM
 
 from coim.envs import MorphEnv, SimulatorDynamics, WorldModelEnv
+from coim.envs.blueprint import observed
 from coim.envs.simulation import lowest_point
 from coim.models import GaussianEnsemble
 
@@ -198,3 +199,10 @@ def test_the_simulator_as_a_dream_takes_up_any_state(body: type[MorphEnv]) -> No
     action = torch.zeros(2, env.action_spec.shape[-1])
     predicted = dream.advance(here["observation"], action, here["design"])[0]
     torch.testing.assert_close(predicted, env.move(action)[0], atol=1e-5, rtol=1e-5)
+
+
+def test_a_joint_without_a_name_is_called_by_what_it_moves() -> None:
+    named = [name for name, _ in observed(Drone(num_runs=1))]
+    assert len(named) == 13
+    assert named[:2] == ["z of hub", "w of the quaternion of hub"]
+    assert "velocity of hub along x" in named

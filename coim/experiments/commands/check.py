@@ -20,17 +20,20 @@ from coim.experiments.run.machine import available_cores, check_compiler, folder
 from coim.products import fastest, has_bfloat16, kind_of_processor
 
 NEEDED = ("coim", "torch", "torchrl", "tensordict", "mujoco", "gymnasium", "pyswarms", "numpy")
-# Packages of the extras, and what does not work without them.
+# Packages beside the library: what does not work without them, and how they are installed.
 OPTIONAL = {
-    "matplotlib": "no pictures, no report and no figures",
-    "scipy": "no intervals in figures and tables",
-    "imageio-ffmpeg": "no films",
-    "ray": "no studies",
-    "wandb": "--log wandb has nothing to log with",
-    "tensorboard": "--log tensorboard has nothing to log with",
-    "trackio": "--log trackio has nothing to log with",
-    "onnxruntime": "coim export writes no ONNX",
-    "safetensors": "coim export writes no safetensors",
+    "matplotlib": ("no pictures, no report and no figures", "'coim[experiments]'"),
+    "scipy": ("no intervals in figures and tables", "'coim[experiments]'"),
+    "imageio-ffmpeg": ("no films", "'coim[experiments]'"),
+    "ray": ("no studies", "'coim[experiments]'"),
+    "botorch": ("no --method grounded, no DesignPosterior", "'coim[posterior]'"),
+    "wandb": ("--log wandb has nothing to log with", "'coim[experiments]'"),
+    "tensorboard": ("--log tensorboard has nothing to log with", "'coim[tensorboard]'"),
+    "trackio": ("--log trackio has nothing to log with", "trackio"),
+    "onnxruntime": ("coim export writes no ONNX", "'coim[export]'"),
+    "safetensors": ("coim export writes no safetensors, coim watch --pretrained reads none", "'coim[export]'"),
+    "minari": ("coim dataset writes nothing", "'coim[export]'"),
+    "mjviser": ("no coim watch --live", "'coim[live]'"),
 }
 SEEN = "/proc/cpuinfo"  # Linux
 # Draws one picture in a process of its own: MuJoCo reads MUJOCO_GL once, and a broken driver can end the process.
@@ -76,12 +79,11 @@ def versions() -> list[Finding]:
     """Versions of what coim is made of."""
     found = [Finding("python", f"{platform.python_version()}, {sys.executable}")]
     found += [Finding(name, version(name)) for name in NEEDED]
-    for name, lack in OPTIONAL.items():
+    for name, (lack, installed_by) in OPTIONAL.items():
         try:
             found.append(Finding(name, version(name)))
         except PackageNotFoundError:
-            way = f"{lack} without {name}: pip install 'coim[experiments]'"
-            found.append(Finding(name, "not installed", way))
+            found.append(Finding(name, "not installed", f"{lack} without {name}: pip install {installed_by}"))
     return found
 
 

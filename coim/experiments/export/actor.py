@@ -162,8 +162,12 @@ FORMATS: dict[str, tuple[Callable[[Actor, Path], None], Callable[[Path], Acting]
 }
 
 
-def needed(*names: str) -> Any:
+def needed(*names: str, otherwise: str = ", or take a file .pt2, which torch alone writes and reads") -> Any:
     """Import what a format needs; the last of the modules.
+
+    Args:
+        names: of the modules.
+        otherwise: the way to do without them, for the message.
 
     Raises:
         ValueError: if one is not installed; the message says how to install it.
@@ -173,8 +177,7 @@ def needed(*names: str) -> Any:
             module = import_module(name)
         except ModuleNotFoundError as error:
             raise ValueError(
-                f"{name.split('.')[0]} is not installed ({error}): pip install 'coim[export]', or take a file .pt2, "
-                "which torch alone writes and reads"
+                f"{name.split('.')[0]} is not installed ({error}): pip install 'coim[export]'{otherwise}"
             ) from None
     return module
 

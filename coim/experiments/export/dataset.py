@@ -42,7 +42,8 @@ def write_dataset(folder: Path, name: str, *, run: int | None, body: str | None)
         ValueError: if there is no such run or no checkpoint, a dataset of this name is there already, or a package is
             not installed.
     """
-    minari = needed("h5py", "minari")
+    minari = needed("h5py", "minari", otherwise="")
+    minari.dataset.minari_dataset.parse_dataset_id(name)  # refuses it before a folder of that name is made
     loaded = opened(folder, body, run=run)
     rows = replay_of(folder)
     runs = range(rows["action"].shape[1]) if run is None else [run]

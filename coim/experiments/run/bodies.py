@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -31,6 +32,8 @@ def imported_body(name: str | None) -> type[MorphEnv] | None:
     module, _, called = name.partition(":")
     if not module or not called:
         raise ValueError(f"--body is {name!r}, it must be module:Class, such as coim.envs.hopper:HopperMorph")
+    if not {"", here := str(Path.cwd())} & {*sys.path}:
+        sys.path.insert(0, here)  # Python looks there for a script or -m, and not for an installed command
     try:
         body = getattr(import_module(module), called)
     except (ImportError, AttributeError) as error:

@@ -118,7 +118,11 @@ def sentence_of(error: BaseException) -> str:
         'runs/a: No such file or directory'
         >>> sentence_of(KeyError("seed"))
         "'seed' (KeyError)"
+        >>> sentence_of(ModuleNotFoundError("No module named 'imageio'", name="imageio"))
+        "No module named 'imageio': pip install 'coim[experiments]' has all that this command needs"
     """
+    if isinstance(error, ModuleNotFoundError) and error.name and error.name.split(".")[0] != "coim":
+        return f"{error}: pip install 'coim[experiments]' has all that this command needs"
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if str(error) and not isinstance(error, KeyError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 import shutil
@@ -57,6 +58,20 @@ def check_compiler(without: str = "--no-compile --no-native-episodes") -> None:
             f"compiled code is put into {folder} and loaded from there, which {why}; name another folder by the "
             f"environment variable TORCHINDUCTOR_CACHE_DIR, or {without}"
         )
+
+
+def check_logger(kind: str) -> None:
+    """Refuse to log by a package that is not installed, before anything is written.
+
+    Args:
+        kind: the setting ``log``.
+
+    Raises:
+        ValueError: with the way to install it.
+    """
+    package = kind.removesuffix("-offline")
+    if kind != "off" and importlib.util.find_spec(package) is None:
+        raise ValueError(f"--log {kind} needs {package}, which is not installed: pip install {package}, or --log off")
 
 
 def check_native_episodes() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import configparser
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,10 +23,19 @@ def test_every_part_of_this_machine_has_a_line(capsys: pytest.CaptureFixture) ->
 
 
 def test_a_missing_package_names_what_is_lost_and_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(check, "OPTIONAL", {"no-such-package": "no studies"})
+    monkeypatch.setattr(check, "OPTIONAL", {"no-such-package": ("no studies", "'coim[experiments]'")})
     finding = check.versions()[-1]
     assert finding.found == "not installed"
     assert finding.lack == "no studies without no-such-package: pip install 'coim[experiments]'"
+
+
+def test_every_optional_package_is_one_of_the_extra_that_is_named_for_it() -> None:
+    """trackio is in none: it wants an older pillow than the rest."""
+    setup = configparser.ConfigParser()
+    setup.read(Path(__file__).parents[3] / "setup.cfg")
+    extras = {name: packages.split() for name, packages in setup["options.extras_require"].items()}
+    for package, (_, by) in check.OPTIONAL.items():
+        assert by == package or package in extras[by.removeprefix("'coim[").removesuffix("]'")]
 
 
 def test_a_processor_without_bfloat16_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,5 +57,16 @@ def test_minari_reads_the_episodes_of_a_run_and_makes_its_environment(
 
 def test_a_missing_package_is_said(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(SystemExit, match=r"h5py is not installed .*: pip install 'coim\[export\]'"):
+    with pytest.raises(SystemExit, match=r"h5py is not installed .*: pip install 'coim\[export\]'$"):
         main([str(fleet), "--name", "first-v0"])
+
+
+def test_a_name_that_minari_refuses_leaves_no_folder(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    with pytest.raises(SystemExit, match="Malformed dataset ID: bad name"):
+        main([str(fleet), "--name", "bad name"])
+    assert not list(tmp_path.rglob("bad name"))

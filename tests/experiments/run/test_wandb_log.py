@@ -103,6 +103,15 @@ def test_a_logger_that_is_not_installed_is_said(
         logged(tmp_path, kind)
 
 
+def test_a_run_whose_logger_is_not_installed_is_refused_before_it_has_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"--log trackio needs trackio, .*: pip install trackio, or --log off"):
+        run(tmp_path / "run", log="trackio")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_killed_wandb_is_told_and_the_run_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
