@@ -20,11 +20,12 @@ PLANE, SPHERE, CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for nam
 ELLIPSOID, CYLINDER, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "BOX"))
 FLOOR = "floor"  # name of the floor of a file that has none
 PLANAR = (("slide along x", SLIDE, (1, 0, 0)), ("slide along z", SLIDE, (0, 0, 1)), ("hinge about y", HINGE, (0, 1, 0)))
+SEGMENTS = "spheres, capsules, cylinders, boxes and ellipsoids as its segments"
 RULES = {
     "planar": "a planar runner has a root with a slide along x, a slide along z and a hinge about y, hinges about y as "
-    "its joints, and capsules as its segments",
+    f"its joints, and {SEGMENTS}",
     "free": "a robot that moves freely has one root with a free joint, hinges and slides as its other joints, and "
-    "spheres, capsules, cylinders, boxes and ellipsoids as its segments",
+    + SEGMENTS,
     "fixed": "a robot on a fixed base has hinges and slides",
 }
 MOTORS = "every actuator is a motor on a joint with a range, such as <motor joint='knee' gear='100' ctrlrange='-1 1'/>"
@@ -136,7 +137,7 @@ def _against_planar(model: mujoco.MjModel) -> Iterator[str]:
     for place in range(len(PLANAR), model.njnt):
         if model.jnt_type[place] != HINGE or not np.allclose(np.abs(data.xaxis[place, 1]), 1):
             yield f"{_described(model, data, place)} as joint {place}, not a hinge about y"
-    yield from _against_shapes(model, CAPSULE)
+    yield from _against_shapes(model)
 
 
 def _against_free(model: mujoco.MjModel) -> Iterator[str]:
@@ -144,7 +145,7 @@ def _against_free(model: mujoco.MjModel) -> Iterator[str]:
     if model.jnt_type[0] != FREE or (model.jnt_type == FREE).sum() != 1 or (model.body_parentid[1:] == 0).sum() != 1:
         yield "more than one body that moves by itself, or a free joint that is not the first one"
     yield from _against_joints(model, start=1)
-    yield from _against_shapes(model, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
+    yield from _against_shapes(model)
 
 
 def _against_fixed(model: mujoco.MjModel) -> Iterator[str]:
@@ -163,12 +164,12 @@ def _against_joints(model: mujoco.MjModel, *, start: int) -> Iterator[str]:
             yield f"{_described(model, data, place)} as joint {place}, not a hinge or a slide"
 
 
-def _against_shapes(model: mujoco.MjModel, *known: int) -> Iterator[str]:
+def _against_shapes(model: mujoco.MjModel) -> Iterator[str]:
     """Yield segments whose lowest point is not known."""
     if not colliding(model).size:
         yield "no segment that can touch the floor"
     for geom in colliding(model):
-        if model.geom_type[geom] not in known:
+        if model.geom_type[geom] not in (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX):
             shape = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
             yield (
                 f"a segment, {_named(model.geom(geom), geom)}, that is a {shape} (with contype='0' conaffinity='0' it "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,10 +11,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from coim import morph_from_mjcf
 from coim.envs import BODIES, HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
 from coim.envs.kinematics import Kinematics
 
 ROWS = 100
+HOPPER = Path(__file__).parents[2] / "coim/envs/assets/hopper.xml"
 
 
 def any_poses(env: MorphEnv, rows: int = ROWS) -> tuple[Tensor, Tensor]:
@@ -58,6 +62,38 @@ def test_a_transferred_state_keeps_its_joints_velocities_and_clearance_and_comes
     ]  # the height of the root
     torch.testing.assert_close(env.clearance(moved, other), env.clearance(observation, design))
     torch.testing.assert_close(env.transfer(moved, other, design), observation)
+
+
+def test_a_planar_runner_with_a_box_for_a_foot_and_a_ball_for_a_torso(tmp_path: Path) -> None:
+    text = HOPPER.read_text()
+    for capsule, other in (
+        ('name="torso" size=".05 .2"', 'name="torso" type="sphere" size=".2"'),
+        ('size=".06 .195"', 'type="box" size=".03 .06 .2"'),
+    ):
+        assert capsule in text
+        text = text.replace(capsule, other)
+    (tmp_path / "boxed.xml").write_text(text)
+    body = morph_from_mjcf(tmp_path / "boxed.xml", {"thigh": ["thigh"], "shank": ["leg"]}, HopperMorph.reward)
+    env = body(num_runs=3, seed=0)
+    observation, design = any_poses(env)
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy() * (0.03, 0.06, 0.2)
+    truth = []
+    for row, factors in zip(observation, design):
+        model = env.simulations.body(factors.numpy()).compile()
+        data = mujoco.MjData(model)
+        data.qpos[1:] = row.numpy()[: model.nq - 1]
+        mujoco.mj_kinematics(model, data)
+        foot, torso = data.geom("foot"), data.geom("torso")
+        others = [
+            data.geom(name).xpos[2] - model.geom(name).size[0] - model.geom(name).size[1] * abs(data.geom(name).xmat[8])
+            for name in ("thigh", "leg")
+        ]
+        of_foot = foot.xpos[2] + (corners @ foot.xmat.reshape(3, 3).T)[:, 2].min()
+        truth.append(min(*others, of_foot, torso.xpos[2] - 0.2))
+    assert env.clearance(observation, design).squeeze(-1).numpy() == pytest.approx(truth, abs=1e-9)
+    rows = env.rollout(200)
+    assert rows["next", "observation"].isfinite().all()
+    assert env.clearance(rows["next", "observation"], rows["next", "design"]).min() > -0.05
 
 
 def test_a_standing_hopper_rises_by_what_its_legs_grow() -> None:

@@ -56,7 +56,6 @@ def test_another_robot_is_refused_by_name_when_it_is_made() -> None:
         ('axis="0 -1 0" armature', 'axis="1 0 0" armature', r"a hinge along \[1.0, 0.0, 0.0\] \(thigh\) as joint 3"),
         ('ctrllimited="true"', 'ctrllimited="false"', "a motor, thigh, without a ctrlrange"),
         ('<motor name="leg" joint="leg"/>', '<position name="leg" joint="leg"/>', "an actuator, leg, that is no motor"),
-        ('geom name="leg"', 'geom name="leg" type="box"', "a segment, leg, that is a box"),
         ('geom name="floor"', 'geom name="floor" pos="0 0 1"', "no floor: no horizontal plane at z = 0"),
         ('geom name="floor"', 'geom name="floor" zaxis="1 0 0"', "no floor: no horizontal plane"),
     ],
@@ -64,8 +63,16 @@ def test_another_robot_is_refused_by_name_when_it_is_made() -> None:
 def test_what_no_body_can_have_is_named(drawn: str, changed: str, different: str) -> None:
     text = HOPPER.read_text()
     assert drawn in text
-    model = mujoco.MjModel.from_xml_string(text.replace(drawn, changed).replace('size=".04 .25"', 'size=".04 .25 .04"'))
+    model = mujoco.MjModel.from_xml_string(text.replace(drawn, changed))
     with pytest.raises(ValueError, match=f"Hopper has {different}.*; (a planar runner|every actuator|add a geom)"):
+        read_root(model, "Hopper")
+
+
+def test_a_mesh_that_could_touch_the_floor_is_named() -> None:
+    text = HOPPER.read_text().replace('geom name="leg"', 'geom name="leg" type="mesh" mesh="shin"')
+    mesh = '<asset><mesh name="shin" vertex="0 0 0 1 0 0 0 1 0 0 0 -1"/></asset>'
+    model = mujoco.MjModel.from_xml_string(text.replace("<worldbody>", f"{mesh}<worldbody>", 1))
+    with pytest.raises(ValueError, match="Hopper has a segment, leg, that is a mesh .*; a planar runner"):
         read_root(model, "Hopper")
 
 
