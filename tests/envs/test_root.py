@@ -72,7 +72,7 @@ def test_a_mesh_that_could_touch_the_floor_is_named() -> None:
     text = HOPPER.read_text().replace('geom name="leg"', 'geom name="leg" type="mesh" mesh="shin"')
     mesh = '<asset><mesh name="shin" vertex="0 0 0 1 0 0 0 1 0 0 0 -1"/></asset>'
     model = mujoco.MjModel.from_xml_string(text.replace("<worldbody>", f"{mesh}<worldbody>", 1))
-    with pytest.raises(ValueError, match="Hopper has a segment, leg, that is a mesh .*; a planar runner"):
+    with pytest.raises(ValueError, match=r"Hopper has a segment, leg, that is a mesh .*; a planar runner"):
         read_root(model, "Hopper")
 
 
