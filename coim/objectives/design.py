@@ -24,7 +24,7 @@ from torchrl.objectives import LossModule
 from coim.calling import called_as
 
 from .functional import design_value
-from .moving import move
+from .moving import lent, move
 from .runs import check_num_runs
 
 # Evaluated at a time: on a CPU what keeps the activations in the cache of a core, elsewhere what fits into memory.
@@ -165,8 +165,8 @@ class DesignValue(LossModule):
         evaluate = self._bare_chunk if self._networks_are_bare() else self._chunk
         with (
             torch.set_grad_enabled(torch.is_grad_enabled() and designs.requires_grad),
-            weights[0].to_module(self.policy, preserve_module_state=False),
-            weights[1].to_module(self.qvalue, preserve_module_state=False),
+            lent(weights[0], self.policy),
+            lent(weights[1], self.qvalue),
         ):
             q = [evaluate(states, chunk).to(designs.dtype) for chunk in designs.chunk(self._num_chunks(designs))]
         value = torch.cat([design_value(part) for part in q])

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from .functional import gaussian_nll
-from .moving import move
+from .moving import lent, move
 from .runs import check_batch, check_by_row, check_num_runs, check_runs_last, split_runs
 
 
@@ -112,7 +112,7 @@ class EnsembleNLLLoss(LossModule):
         check_batch(observation.shape[:-1], self.num_runs)
         check_runs_last(tensordict, self.num_runs)
         next_observation = tensordict[unravel_key(("next", self.tensor_keys.observation))]
-        with self.ensemble_params.to_module(self.ensemble, preserve_module_state=False):
+        with lent(self.ensemble_params, self.ensemble):
             out = self.ensemble(tensordict.select(*self.ensemble.in_keys))
             target = self.ensemble.standardised_target(observation, next_observation)
         mean, log_var = out[self.tensor_keys.mean], out[self.tensor_keys.log_var]

@@ -39,7 +39,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from .functional import bellman_target, mixing_weights, policy_loss, qvalue_loss, soft_value
-from .moving import move
+from .moving import lent, move
 from .runs import check_batch, check_by_row, check_num_runs, check_runs_last, split_runs
 
 
@@ -238,7 +238,7 @@ class CoImSACLoss(LossModule):
         """J_Q of Eq. 7, with a gradient for the critics only, and the error of each row, ``[*B, (K)]``."""
         tensordict = tensordict.detach()  # no gradient to the networks that made the rows
         target = self._td_target(tensordict)
-        with self.qvalue_params.to_module(self.qvalue, preserve_module_state=False):
+        with lent(self.qvalue_params, self.qvalue):
             q = self._values(tensordict)
         td_error = (q.detach() - target.unsqueeze(-1)).abs().amax(-1)
         return self._reduced(qvalue_loss(q, target), tensordict), td_error
@@ -247,7 +247,7 @@ class CoImSACLoss(LossModule):
         """J_pi of Eq. 8, with a gradient for the policy only, and the log-densities, ``[*B, (K)]``."""
         tensordict = tensordict.detach()
         action, log_prob = self._act(tensordict)
-        with self.qvalue_params.data.to_module(self.qvalue, preserve_module_state=False):
+        with lent(self.qvalue_params.data, self.qvalue):
             q = self._values(tensordict, action)
         loss = self._reduced(policy_loss(q, log_prob, self.alpha), tensordict)
         return loss, log_prob.detach()
@@ -259,7 +259,7 @@ class CoImSACLoss(LossModule):
         if design is not None and self.tensor_keys.design not in after.keys(True):
             after.set(self.tensor_keys.design, design)
         action, log_prob = self._act(after)
-        with self.target_qvalue_params.to_module(self.qvalue, preserve_module_state=False):
+        with lent(self.target_qvalue_params, self.qvalue):
             value = soft_value(self._values(after, action), log_prob, self.alpha)
         reward, terminated = after[self.tensor_keys.reward], after[self.tensor_keys.terminated]
         reward, terminated = reward.reshape(value.shape), terminated.reshape(value.shape)
@@ -270,7 +270,7 @@ class CoImSACLoss(LossModule):
     def _act(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         with (
             set_exploration_type(ExplorationType.RANDOM),
-            self.policy_params.to_module(self.policy, preserve_module_state=False),
+            lent(self.policy_params, self.policy),
         ):
             dist = self.policy.get_dist(tensordict.select(*self.policy.in_keys))
         noise = tensordict.get(self.tensor_keys.noise, None)
