@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from numbers import Integral
 
+import numpy as np
 import torch
 
 from coim.buffers import Buffers
@@ -78,6 +79,25 @@ def check_bodies(env: MorphEnv, evaluation_env: MorphEnv) -> None:
     ):
         if own != other:
             raise ValueError(f"evaluation_env has {what} {other}, env has {own}; make both alike but for their seeds")
+    if what := _different(env, evaluation_env):
+        raise ValueError(f"evaluation_env has another {what} than env; make both alike but for their seeds")
+
+
+# Of a compiled body: arguments of a class may change them, such as the lengths of its segments at xi = 1.
+BODY = ("geom_size", "geom_pos", "geom_quat", "geom_friction", "body_pos", "body_quat", "body_mass", "body_inertia")
+BODY += ("jnt_range", "jnt_axis", "jnt_stiffness", "dof_damping", "dof_armature", "actuator_gear", "actuator_ctrlrange")
+
+
+def _different(env: MorphEnv, other: MorphEnv) -> str | None:
+    """What differs between two robots of one class, or None."""
+    shapes = [list(bodies.observation_spec["observation"].shape) for bodies in (env, other)]
+    if shapes[0] != shapes[1]:
+        return f"shape of observations ({shapes[1]}, not {shapes[0]})"
+    if env.step_seconds != other.step_seconds:
+        return f"control step ({other.step_seconds:g} s, not {env.step_seconds:g} s)"
+    unit = np.ones(env.DESIGN_SIZE)
+    own, others = (bodies.simulations.body(unit).compile() for bodies in (env, other))
+    return next((name for name in BODY if not np.array_equal(getattr(own, name), getattr(others, name))), None)
 
 
 def check_learners(
@@ -188,6 +208,8 @@ def check_model(env: MorphEnv, model: object) -> None:
             f"the dream simulates a {type(model.bodies).__name__}, the bodies are of {type(env).__name__}; simulate "
             "those"
         )
+    if isinstance(model, SimulatorDynamics) and (what := _different(env, model.bodies)):
+        raise ValueError(f"the dream's bodies have another {what} than env; make both alike but for their seeds")
     if not isinstance(model, GaussianEnsemble):
         return
     sizes, runs, network = sizes_of(env), env.batch_size.numel(), model.network

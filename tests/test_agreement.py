@@ -21,6 +21,7 @@ from coim import (
     EpisodeDone,
     GaussianEnsemble,
     GradientSearch,
+    HalfCheetahMorph,
     HopperMorph,
     ImaginedReplay,
     KnownDesigns,
@@ -33,7 +34,7 @@ from coim import (
     make_policy,
     make_qvalue,
 )
-from coim.agreement import check_learners
+from coim.agreement import check_bodies, check_learners, check_model
 
 ENV = HopperMorph(num_runs=2, episode_steps=STEPS, seed=0)
 WALKER = WalkerMorph(num_runs=2, seed=0)
@@ -287,6 +288,18 @@ def test_networks_that_were_moved_after_their_learner_was_made_are_refused(which
 
 def test_the_simulator_of_the_same_body_may_imagine() -> None:
     algorithm(**simulated_dream(HopperMorph))
+
+
+def test_two_robots_of_one_class_that_are_drawn_otherwise_are_no_pair() -> None:
+    printed = (0.29, 0.3, 0.188, 0.29, 0.3, 0.188)
+    one, other = HalfCheetahMorph(seed=0), HalfCheetahMorph(seed=1, segment_lengths=printed)
+    with pytest.raises(ValueError, match="evaluation_env has another geom_size than env; make both alike"):
+        check_bodies(one, other)
+    with pytest.raises(ValueError, match="the dream's bodies have another geom_size than env; make both alike"):
+        check_model(one, SimulatorDynamics(other))
+    check_bodies(other, HalfCheetahMorph(seed=0, segment_lengths=printed))
+    with pytest.raises(ValueError, match=r"another shape of observations \(\[1, 17\], not \[1, 18\]\) than env"):
+        check_bodies(WalkerMorph(seed=0), WalkerMorph(seed=1, observe_root_x=False))
 
 
 def test_a_search_within_narrower_bounds_and_one_that_says_nothing_are_taken() -> None:
