@@ -157,7 +157,8 @@ class TransitionBuffer(TensorDictReplayBuffer):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled rows (views, not copies), the writer's place and the generator's state."""
-        rows = self[:].exclude("index").flatten_keys(".").to_dict() if len(self) else {}
+        # From the storage, and not as samples are: transforms of the buffer have not changed what is kept.
+        rows = self.storage[: len(self)].flatten_keys(".").to_dict() if len(self) else {}
         return {"rows": rows, "writer": self.writer.state_dict(), "generator": self._rng.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -176,7 +177,7 @@ class TransitionBuffer(TensorDictReplayBuffer):
                 # That one was full and about to overwrite its oldest row. There is room here: behind the newest.
                 stored = torch.cat([stored[writer["_cursor"] :], stored[: writer["_cursor"]]])
                 writer["_cursor"] = count
-            self.extend(stored)
+            self.writer.extend(stored.to(self.storage.device))
         writer["_cursor"] %= self.capacity
         self.writer.load_state_dict(writer)
         restore_generator(self._rng, state_dict["generator"])

@@ -11,7 +11,7 @@ import torch
 from counted_rows import filled, keys_of, make_rows
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, RewardScaling
 
 from coim.batches import sample_batches
 from coim.buffers import (
@@ -102,6 +102,20 @@ def test_a_checkpoint_holds_the_filled_rows_and_sampling_goes_on(tmp_path: Path)
         assert (buffer[:].exclude("index") == other[:].exclude("index")).all()
         assert (sample_batches(buffer) == sample_batches(other)).all()
     assert len(resumed.art) == 0
+
+
+def test_a_checkpoint_of_a_buffer_that_transforms_what_it_samples_holds_what_is_stored() -> None:
+    def made(seed: int) -> TransitionBuffer:
+        buffer = TransitionBuffer(9, num_runs=2, seed=seed)
+        buffer.append_transform(RewardScaling(0.0, 10.0, in_keys=[("next", "reward")]))
+        return buffer
+
+    buffer, resumed = made(0), made(1)
+    buffer.extend(make_rows(8, 2))
+    resumed.load_state_dict(buffer.state_dict())
+    assert torch.equal(buffer.state_dict()["rows"]["next.reward"], make_rows(8, 2)["next", "reward"])
+    assert torch.equal(resumed.state_dict()["rows"]["next.reward"], make_rows(8, 2)["next", "reward"])
+    assert torch.equal(resumed.sample(20)["next", "reward"], buffer.sample(20)["next", "reward"])
 
 
 def test_one_time_step_is_stored_as_many_are() -> None:
