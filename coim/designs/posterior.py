@@ -215,6 +215,8 @@ class _PriorMean(Mean):
         return self.intercept + self.slope * value + self.trend * order
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()  # the caller may be under no_grad: a whole training is
 def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
     """The process of highest posterior density for inputs ``[N, D + 2]`` and standardised returns ``[N]``."""
 
@@ -224,6 +226,7 @@ def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
     def around(median: float) -> LogNormalPrior:
         return LogNormalPrior(math.log(median), SPREAD)
 
+    inputs, targets = inputs.clone(), targets.clone()  # those of an inference mode have no gradients
     num_entries = inputs.shape[-1] - 2
     smooth = RBFKernel(
         active_dims=tuple(range(num_entries)), lengthscale_prior=around(LENGTH), lengthscale_constraint=positive(LENGTH)

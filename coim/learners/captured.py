@@ -33,7 +33,8 @@ class FlatAdam(torch.optim.Adam):
             state["max_exp_avg_sq"] = torch.zeros_like(weights)
         state["step"] += 1
         beta1, beta2 = group["betas"]
-        torch._fused_adam_(
+        kernel = torch._fused_adamw_ if group["decoupled_weight_decay"] else torch._fused_adam_
+        kernel(
             [weights],
             [weights.grad],
             [state["exp_avg"]],

@@ -27,6 +27,8 @@ from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Network
 from coim.objectives.runs import by_update, check_batch, check_runs_last
 
+STILL = 1e-6  # of an observation, if that is above 1: less than float32 tells apart, as in RunningNormaliser.std
+
 
 class DynamicsLearner(FlatLearner):
     """The Gaussian ensemble, which learns Eq. 6 with Adam and weight decay (Sec. 6.1).
@@ -119,7 +121,8 @@ class DynamicsLearner(FlatLearner):
             rows: ``[*B, (K)]`` on any device, at least two for each run.
 
         Returns:
-            Mean over rows, members and observation entries, ``[K]``; predicting "nothing changes" scores about 1.
+            Mean over rows, members and the observation entries that change in these rows, ``[K]``; predicting "nothing
+            changes" scores about 1. It is 0 where none of them changes.
 
         Raises:
             ValueError: as `observe` does.
@@ -129,7 +132,9 @@ class DynamicsLearner(FlatLearner):
         means, _ = self.ensemble.moments(observation, rows["action"], rows["design"])
         error = self.ensemble.wrapped(means - following.unsqueeze(-2)).square().mean((0, -2))
         variance = self.ensemble.wrapped(following - observation).var(0, correction=0)
-        return (error / variance.clamp(min=1e-12)).mean(-1)
+        # An entry that stands still, such as a target, has no unit: its variance is the rounding of floats.
+        varied = variance.sqrt() > STILL * observation.abs().amax(0).clamp(min=1)
+        return torch.where(varied, error / variance, 0).sum(-1) / varied.sum(-1).clamp(min=1)
 
     @torch.no_grad()
     def update(self, batches: TensorDictBase) -> TensorDict:

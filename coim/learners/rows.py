@@ -93,6 +93,17 @@ def check_sac_rows(rows: TensorDictBase, keys: CoImSACLoss._AcceptedKeys) -> Non
     if renamed:
         raise ValueError(f"SACLearner reads rows by the keys of the schema, not by {renamed}; rename their entries")
     check_one_step(rows, keys.steps_to_next_obs)
+    if noise := [key for key in (keys.noise, ("next", keys.noise)) if key in rows.keys(True)]:
+        raise ValueError(
+            f"rows with {noise[0]!r}: SACLearner draws the policy's noise itself; train with CoImSACLoss, or exclude() "
+            "the key"
+        )
+    after = ("next", keys.design)
+    if after in rows.keys(True) and not torch.equal(rows[keys.design], rows[after]):
+        raise ValueError(
+            f"rows whose {after!r} is another design than {keys.design!r}: SACLearner asks the target about the body "
+            "that acted; train with CoImSACLoss, or cut the rows where bodies change"
+        )
     if keys.priority_weight in rows.keys(True):
         raise ValueError(
             f"rows with {keys.priority_weight!r}: SACLearner has no importance weights; train with CoImSACLoss, or "

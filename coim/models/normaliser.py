@@ -66,13 +66,18 @@ class RunningNormaliser(nn.Module):
             rows: ``[*B, (K,) F]``, any number of them.
 
         Raises:
-            ValueError: if the shape does not end in ``[(K,) F]``: rows would be counted for the wrong run.
+            ValueError: if the shape does not end in ``[(K,) F]``: rows would be counted for the wrong run. Or if a
+                number is NaN or infinite, which the statistics would be from then on.
         """
         if rows.shape[-self.mean.ndim :] != self.mean.shape:
             raise ValueError(f"rows of shape {list(rows.shape)} must end in {list(self.mean.shape)}")
         rows = rows.to(self.mean.dtype).reshape(-1, *self.mean.shape)
         if not len(rows):
             return
+        if not (finite := rows.isfinite()).all():
+            row, *_, feature = (~finite).nonzero()[0].tolist()
+            found = rows[~finite][0].item()
+            raise ValueError(f"row {row} has {found} as feature {feature}; drop such rows")
         batch_mean = rows.mean(0)
         shift, total = batch_mean - self.mean, self.count + len(rows)
         self.square_sum += (rows - batch_mean).square().sum(0) + shift.square() * self.count * len(rows) / total

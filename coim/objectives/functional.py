@@ -113,14 +113,14 @@ def mixing_weights(
         dtype: of the result, torch's default if None.
 
     Returns:
-        ``[R, K]``.  A run without rows of one kind gets nothing from that kind.
+        ``[R, K]``. A run without rows of one kind, or whose rows of it all weigh nothing, gets nothing from that kind.
     """
     if importance is not None:
         importance = importance.to(dtype or torch.get_default_dtype())
         whole = importance.sum(0)
         if mix == "sum":
             whole = torch.where(imagined, (importance * imagined).sum(0), (importance * ~imagined).sum(0))
-        return importance / whole
+        return torch.where(whole > 0, importance / whole, 0)
     if mix == "batch":
         return torch.full(imagined.shape, 1 / imagined.shape[0], dtype=dtype, device=imagined.device)
     num_imagined = imagined.sum(0)

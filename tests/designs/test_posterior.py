@@ -231,3 +231,14 @@ def test_the_difference_of_two_bodies_is_that_of_their_means_and_of_neighbours_s
     own = (posterior.predict(bodies)[1] ** 2 - posterior.noise**2).sqrt()
     assert bool((deviation < own / 2).all())
     assert posterior.difference(bodies, bodies)[1].abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
+def test_it_is_fitted_where_the_caller_wants_no_gradients(context: type) -> None:
+    """A whole run may be under `torch.no_grad`, and the first fit is hours in."""
+    designs = built(12)
+    outside = DesignPosterior(SPEC, designs, returns_of(designs)).predict(built(3, seed=9))
+    with context():
+        inside = DesignPosterior(SPEC, built(12), returns_of(built(12))).predict(built(3, seed=9))
+    for found, expected in zip(inside, outside):
+        torch.testing.assert_close(found, expected)

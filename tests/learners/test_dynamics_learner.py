@@ -225,6 +225,22 @@ def test_predicting_no_change_scores_one() -> None:
     torch.testing.assert_close(learner.error(rows.reshape(10, 100)), learner.error(rows))
 
 
+def test_an_observation_that_stands_still_has_no_part_in_the_error(make_rows: Rows) -> None:
+    """A target, say: what the ensemble is wrong by there is next to nothing, in no unit."""
+    ensemble = GaussianEnsemble.for_env(ToyEnv(), num_members=2, num_cells=(8,)).double()
+    learner = DynamicsLearner(ensemble)
+    rows = make_rows(200, 1)
+    for part in (rows, rows["next"]):
+        part["observation"][..., -1] = 0.7
+    learner.observe(rows)
+    rest = ensemble.wrapped(rows["next", "observation"] - rows["observation"])[..., :-1].var(0, correction=0)
+    means, _ = ensemble.moments(rows["observation"], rows["action"], rows["design"])
+    wrong = (means - rows["next", "observation"].unsqueeze(-2)).square().mean((0, -2))[..., :-1]
+    torch.testing.assert_close(learner.error(rows), (wrong / rest).mean(-1))
+    rows["next", "observation"].copy_(rows["observation"])
+    assert learner.error(rows).tolist() == [0]
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("num_runs", [None, 3])
 def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> None:

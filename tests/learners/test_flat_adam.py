@@ -29,7 +29,13 @@ def step(optimiser: torch.optim.Adam, number: int) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"lr": 0.1, "weight_decay": 1e-2}, {"amsgrad": True, "maximize": True}, {"betas": (0.5, 0.7), "eps": 1e-3}],
+    [
+        {},
+        {"lr": 0.1, "weight_decay": 1e-2},
+        {"weight_decay": 0.5, "decoupled_weight_decay": True},
+        {"amsgrad": True, "maximize": True},
+        {"betas": (0.5, 0.7), "eps": 1e-3},
+    ],
 )
 def test_the_bits_are_those_of_the_stock_optimiser(settings: dict[str, Any]) -> None:
     stock, ours = pair(**settings)

@@ -164,6 +164,12 @@ def test_rows_that_only_the_loss_understands_are_refused(make_rows: Rows) -> Non
         learner.update(rows)
     with pytest.raises(ValueError, match=r"'priority_weight': .* train with CoImSACLoss, or exclude\(\) the key"):
         learner.update(make_rows(8).set("priority_weight", torch.ones(8)))
+    for key in ("noise", ("next", "noise")):
+        with pytest.raises(ValueError, match=r"noise'.*: SACLearner draws the policy's noise itself"):
+            learner.update(make_rows(8).set(key, torch.ones(8, 1)))
+    rows = make_rows(8)
+    with pytest.raises(ValueError, match=r"is another design than 'design'.* cut the rows where bodies change"):
+        learner.update(rows.set(("next", "design"), rows["design"] + 1))
     learner.loss.set_keys(priority="error")  # only written, by the loss
     learner.update(make_rows(8))
     learner.loss.set_keys(reward="pay")

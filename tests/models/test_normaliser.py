@@ -24,6 +24,18 @@ def test_each_run_has_statistics_of_its_own():
     torch.testing.assert_close(fleet(rows)[:, :, 1], alone(rows[:, :, 1]))
 
 
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
+def test_a_number_that_is_none_is_refused_and_changes_nothing(wrong):
+    normaliser = RunningNormaliser(3, num_runs=2)
+    normaliser.update(torch.rand(5, 2, 3))
+    before = {name: value.clone() for name, value in normaliser.state_dict().items()}
+    rows = torch.rand(5, 2, 3)
+    rows[4, 1, 2] = wrong
+    with pytest.raises(ValueError, match=f"row 4 has {wrong} as feature 2; drop such rows"):
+        normaliser.update(rows)
+    assert all(torch.equal(value, before[name]) for name, value in normaliser.state_dict().items())
+
+
 def test_rows_without_the_run_axis_in_its_place_are_refused():
     normaliser = RunningNormaliser(3, num_runs=2)
     with pytest.raises(ValueError, match=r"rows of shape \[2, 5, 3\] must end in \[2, 3\]"):

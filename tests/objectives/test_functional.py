@@ -88,6 +88,12 @@ def test_importance_is_shared_out_within_each_mean():
     assert summed.flatten().tolist() == [0.25, 0.75, 0.5, 0.5]
 
 
+def test_a_kind_whose_rows_all_weigh_nothing_gets_nothing():
+    imagined = torch.tensor([[True], [False]])
+    importance = torch.tensor([[0.0], [2.0]])
+    assert functional.mixing_weights(imagined, "sum", importance=importance).flatten().tolist() == [0, 1]
+
+
 def test_the_nll_is_eq_6_as_printed():
     nll = functional.gaussian_nll(double(1.0, 2.0), log_var=double(0.0, math.log(4.0)), target=double(3.0, 6.0))
     assert nll.item() == pytest.approx(4 + 16 / 4 + math.log(4))
