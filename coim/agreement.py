@@ -90,9 +90,9 @@ BODY += ("jnt_range", "jnt_axis", "jnt_stiffness", "dof_damping", "dof_armature"
 
 def _different(env: MorphEnv, other: MorphEnv) -> str | None:
     """What differs between two robots of one class, or None."""
-    shapes = [list(bodies.observation_spec["observation"].shape) for bodies in (env, other)]
-    if shapes[0] != shapes[1]:
-        return f"shape of observations ({shapes[1]}, not {shapes[0]})"
+    sizes = [bodies.observation_spec["observation"].shape[-1] for bodies in (env, other)]
+    if sizes[0] != sizes[1]:
+        return f"number of observed entries ({sizes[1]}, not {sizes[0]})"
     if env.step_seconds != other.step_seconds:
         return f"control step ({other.step_seconds:g} s, not {env.step_seconds:g} s)"
     unit = np.ones(env.DESIGN_SIZE)

@@ -47,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with on_command_line(own_process=arguments is None):
         if asked.episodes < 1:
             raise ValueError(f"--episodes is {asked.episodes}, it must be at least 1")
+        if asked.seed < 0:
+            raise ValueError(f"--seed is {asked.seed}, it must be at least 0")
         print(f"reading {asked.source}", file=sys.stderr, flush=True)  # imports take seconds
         from coim.experiments.export.evaluation import EVALUATION, evaluate, told, write_table
         from coim.experiments.export.taken import take

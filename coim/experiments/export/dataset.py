@@ -67,10 +67,13 @@ def replay_of(folder: Path) -> dict[str, Tensor]:
     Raises:
         ValueError: if there is none.
     """
-    newest, _ = newest_whole(folder / "checkpoint", files_complaint)
+    rows = ReplayFile(folder / "checkpoint" / "replay.bin")
+    newest, _ = newest_whole(
+        folder / "checkpoint", lambda path: files_complaint(path) or rows.complaint(read_notes(path)["replay"])
+    )
     if newest is None:
         raise ValueError(f"{folder} has no checkpoint yet, or has been archived without its rows")
-    return ReplayFile(folder / "checkpoint" / "replay.bin").peek(read_notes(newest)["replay"])
+    return rows.peek(read_notes(newest)["replay"])
 
 
 def episodes(rows: Mapping[str, Tensor], run: int) -> Iterator[dict[str, Any]]:

@@ -60,7 +60,7 @@ def take(source: Path, design: str, *, run: int | None, policy: Which | None, bo
     Raises:
         ValueError: if there is no such run, design, policy, file or body.
     """
-    if source.is_file() or source.suffix:
+    if not source.is_dir() and (source.is_file() or source.suffix):
         return _from_file(source, design, body)
     loaded = opened(source, body, run=run)
     lengths = numbers(design, loaded.bodies) if "," in design else None
@@ -85,7 +85,7 @@ def take(source: Path, design: str, *, run: int | None, policy: Which | None, bo
         design=tried.design if lengths is None else lengths,
         settings=_episodes(loaded),
         name=named,
-        tried=tried if lengths is None else None,
+        tried=tried if lengths is None and policy != "population" else None,  # its best return is its own policy's
     )
 
 

@@ -160,7 +160,11 @@ def revisions_of(folder: Path) -> set[str]:
     """Revisions of the code that began a run and of those that went on with it, where they are noted."""
     config = read_config(folder)
     noted = [config.get("revision"), *(entry.get("revision", "") for entry in config.get("resumed", []))]
-    return {"unknown" if revision is None else revision[:12] for revision in noted if revision != ""}
+    return {
+        "unknown" if revision is None else revision[:12] + "-dirty" * revision.endswith("-dirty")
+        for revision in noted
+        if revision != ""
+    }
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> str:

@@ -6,7 +6,8 @@ import datetime
 import platform
 import secrets
 import subprocess
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,16 @@ from coim.experiments.run.settings import Settings, plain
 from coim.products import chosen
 
 PACKAGES = ("coim", "torch", "torchrl", "tensordict", "mujoco", "pyswarms", "numpy")
+IF_THERE = ("botorch", "gpytorch", "scipy")  # choose bodies by returns
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that the numbers depend on."""
-    return {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    found = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    for name in IF_THERE:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def describe(environment: str, settings: Settings) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -145,6 +146,8 @@ class Study(Block):
     """More combinations."""
 
     def __post_init__(self) -> None:
+        if not re.fullmatch(r"\w[\w .-]*", self.name):
+            raise ValueError(f"the study's name is {self.name!r}; letters, digits, dots and hyphens name a folder")
         names = [
             "-".join(map(str, place))
             for block in (self, *self.blocks)

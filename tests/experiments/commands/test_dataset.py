@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -70,3 +71,14 @@ def test_a_name_that_minari_refuses_leaves_no_folder(
     with pytest.raises(SystemExit, match="Malformed dataset ID: bad name"):
         main([str(fleet), "--name", "bad name"])
     assert not list(tmp_path.rglob("bad name"))
+
+
+def test_damaged_rows_are_no_dataset(fleet: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(fleet, copy)
+    rows = copy / "checkpoint" / "replay.bin"
+    whole = rows.read_bytes()
+    for damaged in (bytes(64) + whole[64:], whole[: len(whole) // 2]):
+        rows.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"no checkpoint is whole: .*of replay.bin|replay.bin has"):
+            replay_of(copy)

@@ -189,3 +189,34 @@ def test_what_is_told_of_the_body_is_json(fleet: Path, tmp_path: Path) -> None:
     assert told["environment"] == "hopper"
     assert told["settings"] == {"task": "forward", "episode_steps": 8}
     assert torch.equal(torch.tensor(told["design"]), load_run(fleet).best.tried.design)
+
+
+def test_a_policy_does_not_lose_its_body_to_another_one(fleet: Path, tmp_path: Path) -> None:
+    first = tmp_path / "policy.pt2"
+    export.main([str(fleet), "--design", "1", "--to", str(first)])
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for other in ("policy.safetensors", "another.pt2"):
+        with pytest.raises(SystemExit, match=r"policy.pt2 lies in this folder with a body and a README of its own"):
+            export.main([str(fleet), "--design", "2", "--to", str(tmp_path / other)])
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    export.main([str(fleet), "--design", "1", "--to", str(tmp_path / "policy.safetensors")])  # the same body
+    first.unlink()
+    (tmp_path / "policy.safetensors").unlink()
+    export.main([str(fleet), "--design", "2", "--to", str(first)])
+
+
+def test_a_folder_whose_name_has_a_dot_is_a_run(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    shutil.copytree(fleet, tmp_path / "lr0.001")
+    assert evaluated(capsys, str(tmp_path / "lr0.001"), "--episodes", "1")[0].startswith("design ")
+    with pytest.raises(SystemExit, match="--seed is -1, it must be at least 0"):
+        evaluate.main([str(tmp_path / "lr0.001"), "--seed", "-1"])
+
+
+def test_the_populations_policy_is_not_told_the_best_return_of_another(
+    fleet: Path, capsys: pytest.CaptureFixture
+) -> None:
+    own, population = (
+        evaluated(capsys, str(fleet), "--episodes", "1", "--policy", policy) for policy in ("best", "population")
+    )
+    assert any("its best evaluation in the run had" in line for line in own)
+    assert not any("its best evaluation in the run had" in line for line in population)

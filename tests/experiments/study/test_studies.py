@@ -356,6 +356,12 @@ def test_a_cell_that_was_begun_with_episodes_in_python_goes_on_with_them(tmp_pat
     assert not to_go_on(dataclasses.replace(TINY, out=tmp_path / "python")).native_episodes
 
 
+@pytest.mark.parametrize("name", ["../elsewhere", "", "a/b", ".hidden"])
+def test_a_name_that_is_no_folder_of_its_own_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=r"the study's name is .*; letters, digits, dots and hyphens name a folder"):
+        study(name=name)
+
+
 @pytest.mark.parametrize("written", [{}, {"native_episodes": False}, {"native_episodes": True}])
 def test_a_cell_with_episodes_in_python_is_finished_for_a_protocol_that_has_native_ones(
     tmp_path: Path, written: dict[str, bool]
