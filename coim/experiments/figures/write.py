@@ -160,11 +160,19 @@ def revisions_of(folder: Path) -> set[str]:
     """Revisions of the code that began a run and of those that went on with it, where they are noted."""
     config = read_config(folder)
     noted = [config.get("revision"), *(entry.get("revision", "") for entry in config.get("resumed", []))]
-    return {
-        "unknown" if revision is None else revision[:12] + "-dirty" * revision.endswith("-dirty")
-        for revision in noted
-        if revision != ""
-    }
+    return {_shortened(revision) for revision in noted if revision != ""}
+
+
+def _shortened(revision: str | None) -> str:
+    """Twelve digits of a revision, and whether its files had been changed.
+
+    Example:
+        >>> _shortened("9d69483f0c1a22b0-dirty"), _shortened(None)
+        ('9d69483f0c1a-dirty', 'unknown')
+    """
+    if revision is None:
+        return "unknown"
+    return revision[:12] + "-dirty" * revision.endswith("-dirty")
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> str:
