@@ -32,7 +32,7 @@ CELLS = Path(__file__).parents[1] / "docs/results/preview/cells"
 class Asked:
     """What is asked."""
 
-    out: Path = Path("docs/results/value_states.csv")
+    out: Path = Path("runs/value_states.csv")
     """Where the table goes."""
     draws: int = 10
     """Draws of states."""

@@ -51,7 +51,7 @@ class Measured:
     """Folder of the run whose population's policy is the yardstick."""
     study: Path = STUDY
     """Archive of a study of the same body, whose bodies are measured."""
-    out: Path = Path("docs/results/yardstick")
+    out: Path = Path("runs/yardstick")
     """Folder of the tables."""
     num_bodies: int = 2000
     """Uniform bodies."""
@@ -63,6 +63,10 @@ def main(asked: Measured) -> None:
     """Measure, print and write."""
     prepare(1, torch.device("cpu"))
     saved = load_run(asked.run)
+    if saved.bodies.batch_size.numel() > 1:
+        raise ValueError(
+            f"{asked.run} has {saved.bodies.batch_size.numel()} policies, a yardstick is one: --num-runs 1"
+        )
     anywhere = uniform(saved.bodies.design_spec, asked.num_bodies, torch.Generator().manual_seed(0))
     columns = design_columns(saved.bodies.design_names())
     uniform_ones = pd.DataFrame(anywhere.numpy(), columns=columns).assign(arm="uniform", kind="uniform")
@@ -84,6 +88,8 @@ def tried(study: Path, environment: str) -> pd.DataFrame:
         arm, seed = folder.name.removeprefix(f"{environment}-forward-").rsplit("-", 1)
         table = read_frame(folder / DESIGNS.file, DESIGNS)
         found.append(table.assign(arm=arm, seed=int(seed))[table["run"] == 0])
+    if not found:
+        raise ValueError(f"{study} has no run of {environment}; name a study of that body with --study")
     bodies = pd.concat(found).drop(columns=["run", "predicted", "diverged"], errors="ignore")
     listed = study / "retrained" / CHOSEN.file
     if listed.exists():

@@ -39,6 +39,15 @@ def test_bodies_earn_what_the_population_earns_on_them_each_alone(tmp_path: Path
     assert set(table["arm"]) == {"uniform", "grounded", "none", "all"}
 
 
+def test_a_fleet_is_no_yardstick_and_a_study_of_other_bodies_has_nothing_to_measure(tmp_path: Path) -> None:
+    folder = run(tmp_path / "fleet", num_runs=2, num_designs=2, first_episodes=1, imagine="none", episode_steps=8)
+    with pytest.raises(ValueError, match="has 2 policies, a yardstick is one: --num-runs 1"):
+        main(Measured(run=folder, out=tmp_path / "out"))
+    with pytest.raises(ValueError, match="bodies has no run of walker; name a study of that body with --study"):
+        tried(STUDY, "walker")
+    assert not (tmp_path / "out").exists()
+
+
 def test_arms_are_told_by_the_bodies_that_their_runs_found_best() -> None:
     rows = [{"arm": "uniform", "earned": value} for value in (1.0, 2.0, 9.0)]
     for seed, shift in ((0, 0.0), (1, 1.0), (2, 5.0)):

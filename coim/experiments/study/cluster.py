@@ -58,14 +58,20 @@ def ray_running(terminal: TextIO, *, address: str | None = None, workers: int = 
     temporary = tempfile.mkdtemp(prefix="ray-", dir=short_folder())
     try:
         with token_without_file():
-            ray.init(
-                address="local",  # whatever RAY_ADDRESS says
-                num_cpus=workers * cpus,
-                include_dashboard=False,
-                object_store_memory=OBJECT_STORE,
-                _temp_dir=temporary,
-                **common,
-            )
+            try:
+                ray.init(
+                    address="local",  # whatever RAY_ADDRESS says
+                    num_cpus=workers * cpus,
+                    include_dashboard=False,
+                    object_store_memory=OBJECT_STORE,
+                    _temp_dir=temporary,
+                    **common,
+                )
+            except Exception as error:  # Ray raises it bare where the machine is too busy to answer in time
+                raise OSError(
+                    f"Ray did not start on this machine ({str(error).splitlines()[0]}); give the same command again "
+                    "when it is less busy"
+                ) from error
             yield
     finally:
         ray.shutdown()

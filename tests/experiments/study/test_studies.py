@@ -319,6 +319,17 @@ def test_an_address_at_which_no_cluster_is_is_told_at_once(tmp_path: Path) -> No
         entry(["smoke", "--out", str(tmp_path / "s"), "--ray-address", "127.0.0.1:1"])
 
 
+def test_a_machine_too_busy_to_start_ray_is_told_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**options: object) -> None:
+        raise Exception("The current node timed out during startup.\nMore of it")
+
+    monkeypatch.setattr("ray.init", refuse)
+    with pytest.raises(
+        SystemExit, match=r"Ray did not start .*\(The current node timed out .*\); give the same command"
+    ):
+        entry(["smoke", "--out", str(tmp_path / "s"), "--workers", "1"])
+
+
 def test_a_ledger_grows_with_its_study(tmp_path: Path) -> None:
     Ledger(tmp_path / "ledger.csv", study(seeds=(3,)).cells()).note("hopper-forward-none-3", "finished")
     grown = Ledger(tmp_path / "ledger.csv", study().cells())
