@@ -27,8 +27,9 @@ SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a di
 FROM_ABOVE = -25.0  # degrees, elevation of the camera of a robot that does not move in a plane
 ASIDE = 20.0  # degrees by which drawings of lines look along the way of a free robot, so that no leg hides another
 MISSING_GL = (
-    "no picture without OpenGL: set the environment variable MUJOCO_GL=egl before mujoco is imported, "
-    "and install its library (Debian: apt-get install libegl1 libegl-mesa0)"
+    "no picture without OpenGL: install a library that draws without a screen "
+    "(Debian: apt-get install libegl1 libegl-mesa0), and unset the environment variable MUJOCO_GL or set "
+    "MUJOCO_GL=egl before Python starts"
 )
 
 
@@ -58,6 +59,7 @@ class Camera:
             self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._view.fixedcamid = _camera_number(self._model, name)
         try:
+            _draw_without_screen()
             with warnings.catch_warnings():  # glfw warns about the missing screen before mujoco raises
                 warnings.simplefilter("ignore")
                 self._renderer = mujoco.Renderer(self._model, height, width)
@@ -156,13 +158,13 @@ def has_screen() -> bool:
     return sys.platform != "linux" or any(os.environ.get(name) for name in SCREENS)
 
 
-def draw_without_screen() -> None:
+def _draw_without_screen() -> None:
     """Let MuJoCo draw by EGL where there is no screen and nobody has chosen otherwise by ``MUJOCO_GL``.
 
     MuJoCo reads ``MUJOCO_GL`` when it is imported, and ``import coim`` has done that: so it chooses once more.
 
     Raises:
-        ImportError: if the library is not installed; the message says how to install it.
+        ImportError: if the library is not installed.
     """
     if has_screen() or "MUJOCO_GL" in os.environ:
         return
@@ -171,4 +173,5 @@ def draw_without_screen() -> None:
     try:
         importlib.reload(renderer.gl_context)
     except AttributeError as error:  # of PyOpenGL, which finds no such library
-        raise ImportError(MISSING_GL) from error
+        del os.environ["MUJOCO_GL"]  # processes that we start could not import mujoco by it
+        raise ImportError("there is no EGL") from error

@@ -78,8 +78,7 @@ axes.legend()
 # Pictures
 # --------
 #
-# ``render`` draws a body as it stands now. It needs OpenGL, but no screen: set ``MUJOCO_GL=egl`` before Python
-# starts.
+# ``render`` draws a body as it stands now. It needs OpenGL, but no screen.
 
 loaded.bodies.reset()
 try:

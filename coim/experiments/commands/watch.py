@@ -16,7 +16,6 @@ from typing import Literal
 
 import tyro
 
-from coim.envs.camera import draw_without_screen
 from coim.experiments.pretrained import names, policy_file
 from coim.experiments.run.interrupt import on_command_line
 
@@ -68,7 +67,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             return
         if asked.port != Watch.port:
             raise ValueError(f"--port is of --live, leave it out without: {asked.port}")
-        draw_without_screen()
         from coim.experiments.drawing.film import film, film_policy
 
         how = {name: getattr(asked, name) for name in ("design", "steps", "body", "width", "height", "format")}
