@@ -82,8 +82,9 @@ class Segments:
                     geom.fromto = (anchor + (ends - anchor) * xi).ravel()
             for kind, number, middle in plan.carried:
                 part, moved = (geoms if kind == "geom" else sites)[number], (middle - anchor) * (xi - 1)
-                part.pos = part.pos + moved
-                if not isnan(part.fromto[0]):
+                if isnan(part.fromto[0]):
+                    part.pos = part.pos + moved
+                else:
                     part.fromto = part.fromto + np.tile(moved, 2)
             for number, to_joint in plan.hanging:
                 child = bodies[number]

@@ -114,6 +114,16 @@ def test_what_hangs_on_a_segment_moves_with_it_and_density_stays(arm: type[Morph
     assert model.body("upper").mass[0] - lamp == pytest.approx(2 * volumes[1] / volumes[0])  # drawn with 2 kg
 
 
+def test_a_part_that_is_given_by_its_ends_moves_along_and_keeps_its_length(arm_file: Path, tmp_path: Path) -> None:
+    path, bulb = tmp_path / "rod.xml", '<site name="bulb" pos=".25 0 .2"/>'
+    rod = '<geom name="rod" type="capsule" fromto=".25 0 .2 .25 .1 .2" size=".02"/>'
+    path.write_text(arm_file.read_text().replace(bulb, rod))
+    made = morph_from_mjcf(path, {"upper arm": ["upper"]}, slow)
+    longer = made().simulations.body(np.array([2.0])).compile()
+    assert longer.geom("rod").pos.tolist() == pytest.approx([0.5, 0.1, 0.4])
+    assert longer.geom("rod").size[1] == pytest.approx(0.05)
+
+
 def test_an_arm_passes_torchrls_checks_and_has_names_bounds_and_first_designs(arm: type[MorphEnv]) -> None:
     assert (arm.__name__, arm.__module__) == ("TwoLinkArm", __name__)
     env = arm(num_runs=2, seed=0)
