@@ -16,7 +16,7 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from coim.envs.root import Root, find_floor
+from coim.envs.root import Root, find_floor, find_height
 
 PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJoCo draws with texrepeat 1 (measured)
 # Texels along a side of the shadow map, and samples of a pixel. Without a graphics card a picture takes 17 ms with
@@ -24,6 +24,7 @@ PERIOD = 2.0  # m, period of the chequered floor: two squares of 1 m, which MuJo
 SHADOWS, SAMPLES = 512, 0
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display, on Linux
+ROOM = 0.1  # share of a moving robot's size that is left free on each side of it
 FROM_ABOVE = -25.0  # degrees, elevation of the camera of a robot that does not move in a plane
 ASIDE = 20.0  # degrees by which drawings of lines look along the way of a free robot, so that no leg hides another
 MISSING_GL = (
@@ -111,8 +112,39 @@ def drawn_axes(root: Root) -> np.ndarray:
     return np.array([right, [-sin_e * sin_a, -sin_e * cos_a, cos_e], [-cos_e * sin_a, -cos_e * cos_a, -sin_e]])
 
 
+def make_room(spec: mujoco.MjSpec, largest: mujoco.MjModel) -> None:
+    """Let pictures of a body have room for the largest one, in place, if its file has no ``<statistic>`` that says so.
+
+    MuJoCo would count the floor too, in which a robot of half a metre is a few pixels wide.
+
+    Args:
+        spec: the body to be drawn.
+        largest: the longest body of its class, so that all are drawn to one scale.
+    """
+    if not np.isnan(spec.stat.extent):
+        return
+    data = mujoco.MjData(largest)
+    mujoco.mj_kinematics(largest, data)
+    parts = largest.geom_bodyid > 0
+    turns = data.geom_xmat[parts].reshape(-1, 3, 3)
+    middles = data.geom_xpos[parts] + (turns @ largest.geom_aabb[parts, :3, None])[..., 0]
+    halves = (np.abs(turns) @ largest.geom_aabb[parts, 3:, None])[..., 0]
+    low, high = (middles - halves).min(0), (middles + halves).max(0)
+    if find_height(largest) is None:  # it reaches as far to every side of its base
+        base = data.xpos[largest.body_rootid[largest.geom_bodyid[parts][0]]]
+        reach = np.maximum(np.abs(high - base), np.abs(low - base)).max()
+        low, high = base - reach, base + reach
+    else:
+        low[2] = min(low[2], 0.0)  # with the floor under it
+        low, high = low - ROOM * (high - low), high + ROOM * (high - low)
+    spec.stat.extent, spec.stat.center = (high - low).max(), (low + high) / 2
+
+
 def dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
-    """Return a copy with a sky, a floor of 1 m squares, and an off-screen buffer of the size of the picture."""
+    """Return a copy with a sky, a floor of 1 m squares, and an off-screen buffer of the size of the picture.
+
+    A file without a light gets one from above.
+    """
     spec = spec.copy()
     floor = find_floor(spec.compile())
     spec.visual.global_.offwidth = width
@@ -128,6 +160,10 @@ def dress(spec: mujoco.MjSpec, width: int, height: int) -> mujoco.MjSpec:
             width=64,
             height=64,
         )
+    if not spec.lights:
+        sun = spec.worldbody.add_light(pos=[0, 0, 1.3], diffuse=[0.7, 0.7, 0.7], specular=[0.1, 0.1, 0.1])
+        sun.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        sun.mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM  # its shadows are those of the few metres around it
     if floor is None:
         return spec
     spec.add_texture(

@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from coim.envs.camera import Camera
+from coim.envs.camera import Camera, make_room
 from coim.envs.kinematics import Kinematics
 from coim.envs.root import Root, give_floor, read_root
 from coim.envs.segments import Scale, Segments, keep_densities
@@ -350,8 +350,14 @@ class Fleet:
 
     def camera(self, run: int = 0, *, width: int = 480, height: int = 360) -> Camera:
         """Return a camera for many pictures of one row's current body, in any pose ``qpos``; see :meth:`render`."""
-        body = self.simulations.body(self._design[run].numpy())
+        body = self.drawn_body(self._design[run].numpy())
         return Camera(body, width=width, height=height, name=self.CAMERA, root=self.root)
+
+    def drawn_body(self, design: np.ndarray) -> mujoco.MjSpec:
+        """Return the body of a design ``[D]`` for pictures: all designs of a class are drawn to one scale."""
+        body = self.simulations.body(design)
+        make_room(body, self.simulations.body(self.design_bounds()[1].numpy()).compile())
+        return body
 
     @property
     def step_seconds(self) -> float:

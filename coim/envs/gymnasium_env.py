@@ -179,7 +179,7 @@ class GymnasiumEnv(gymnasium.Env[Numbers, Numbers]):
             return
         simulations = self.bodies.simulations
         if not isinstance(self._shown, Window):
-            body = simulations.body(self._design)
+            body = self.bodies.drawn_body(self._design)
             self._shown = Window(body, root=self.bodies.root, step_seconds=self.bodies.step_seconds)
         self._shown.show(simulations.qpos[0])
 

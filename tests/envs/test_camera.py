@@ -6,10 +6,20 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
+import pytest
+from two_link_arm import TWO_LINK_ARM
 
 from coim.envs import AntMorph, HopperMorph
-from coim.envs.camera import drawn_axes
+from coim.envs.camera import drawn_axes, dress, make_room
+from coim.envs.root import give_floor
+
+BOX = """
+<mujoco><worldbody><body pos="0 0 .5">
+  <freejoint/><geom type="box" size=".4 .2 .1"/>
+</body></worldbody></mujoco>
+"""
 
 PICTURES = """
 import numpy as np, torch
@@ -94,3 +104,40 @@ def test_what_is_drawn_by_lines_is_seen_from_the_side_or_a_little_from_above_and
     np.testing.assert_allclose(np.cross(axes[0], axes[1]), axes[2], atol=1e-12)  # lengths and sides are not mirrored
     assert axes[0, 0] > 0.9  # its way goes to the right
     assert axes[2, 0] < 0 < axes[2, 2]
+
+
+def test_a_picture_has_room_for_the_robot_and_the_ground_under_it_not_for_the_floor_far_away() -> None:
+    spec = mujoco.MjSpec.from_string(BOX)
+    give_floor(spec)
+    make_room(spec, spec.compile())
+    assert spec.stat.extent == pytest.approx(1.2 * 0.8)  # a box 0.8 m long, and a tenth on each side
+    assert spec.stat.center.tolist() == pytest.approx([0, 0, 0.3])  # its top is at 0.6 m
+
+
+def test_a_picture_has_room_for_an_arm_on_every_side_of_its_base() -> None:
+    spec = mujoco.MjSpec.from_string(TWO_LINK_ARM)
+    model = spec.compile()
+    make_room(spec, model)
+    data = mujoco.MjData(model)
+    for angle in (0.0, 0.5 * np.pi, np.pi):
+        data.qpos[0] = angle
+        mujoco.mj_kinematics(model, data)
+        tips = data.geom_xpos - spec.stat.center
+        assert (np.abs(tips) + model.geom_size[:, 1:2] < spec.stat.extent / 2).all()
+
+
+def test_all_designs_are_drawn_to_the_scale_of_the_file_or_of_the_longest_body() -> None:
+    env = HopperMorph(seed=0)
+    assert [env.drawn_body(np.full(4, factor)).stat.extent for factor in (0.5, 2.0)] == [2.8, 2.8]
+    own = [mujoco.MjSpec.from_string(BOX) for _ in range(2)]
+    own[1].geoms[0].size = [0.8, 0.2, 0.1]
+    longest = own[1].compile()
+    for spec in own:
+        make_room(spec, longest)
+    assert own[0].stat.extent == own[1].stat.extent == pytest.approx(1.2 * 1.6)
+
+
+def test_a_file_without_a_light_gets_one_and_another_keeps_its_own() -> None:
+    assert dress(mujoco.MjSpec.from_string(BOX), 64, 48).compile().nlight == 1
+    hopper = HopperMorph(seed=0).simulations.body(np.ones(4))
+    assert dress(hopper, 64, 48).compile().light_diffuse.tolist() == hopper.compile().light_diffuse.tolist()
