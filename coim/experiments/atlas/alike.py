@@ -5,10 +5,13 @@ Shapes: R runs, D design.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 DRAWS = 4000  # of R uniform bodies, for what is to be expected by chance
 CHANCE = 0.9
+GIVEN = ("first", "fixed")  # kinds of bodies that no run has chosen: they are the same in every run
 
 
 def distances(best: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -50,9 +53,23 @@ def by_chance(num_runs: int, size: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def in_words(table: np.ndarray, size: int) -> str:
-    """A sentence on the mean distance and what chance would give."""
-    found, (low, high) = mean_distance(table), by_chance(len(table), size)
+def in_words(table: np.ndarray, size: int, kinds: Sequence[str]) -> str:
+    """A sentence on the mean distance and what chance would give.
+
+    Best bodies that were given to the runs are left out: two runs that found nothing better than the same first body
+    do not agree on anything that they found.
+
+    Args:
+        table: distances of the best bodies, ``[R, R]``.
+        size: D.
+        kinds: how the best body of each run was chosen.
+    """
+    own = [run for run, kind in enumerate(kinds) if kind not in GIVEN]
+    given = len(kinds) - len(own)
+    left_out = f"In {given} of {len(kinds)} runs the best body is one that all runs were given. " if given else ""
+    if len(own) < 2:
+        return f"{left_out}Too few remain to say whether what the runs found is more alike than chance."
+    found, (low, high) = mean_distance(table[np.ix_(own, own)]), by_chance(len(own), size)
     if found < low:
         verdict = "they are more alike than chance"
     elif found > high:
@@ -60,6 +77,7 @@ def in_words(table: np.ndarray, size: int) -> str:
     else:
         verdict = "that is no more alike than chance"
     return (
-        f"Mean distance of the best bodies of {len(table)} runs: {found:.2f}; {len(table)} bodies drawn uniformly "
-        f"have {low:.2f} to {high:.2f} in {CHANCE:.0%} of draws: {verdict}. 0 is the same body, 1 are opposite corners."
+        f"{left_out}Mean distance of the best bodies of {len(own)} runs: {found:.2f}; {len(own)} bodies drawn "
+        f"uniformly have {low:.2f} to {high:.2f} in {CHANCE:.0%} of draws: {verdict}. 0 is the same body, "
+        "1 are opposite corners."
     )

@@ -103,7 +103,8 @@ def page(title: str, body: type[MorphEnv], runs: Sequence[RunPart], simulator: S
     """The whole page."""
     bodies = body(num_runs=1, seed=0)
     low, high = (bound.numpy() for bound in bodies.design_bounds())
-    table = alike.distances(np.array([run.bodies[run.best]["design"] for run in runs]), low, high)
+    best = [run.bodies[run.best] for run in runs]
+    table = alike.distances(np.array([row["design"] for row in best]), low, high)
     data = {
         "body": walkers.body_table(bodies),
         "frame_seconds": walkers.frame_seconds(bodies),
@@ -121,7 +122,7 @@ def page(title: str, body: type[MorphEnv], runs: Sequence[RunPart], simulator: S
         names=bodies.design_names(),
         runs=runs,
         distances=table,
-        alike=alike.in_words(table, len(low)) if len(runs) > 1 else "",
+        alike=alike.in_words(table, len(low), [row["kind"] for row in best]) if len(runs) > 1 else "",
         why=data["body"]["why"],
         data=data,
         simulator=simulator,

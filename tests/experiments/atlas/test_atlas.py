@@ -98,15 +98,26 @@ def test_several_runs_are_compared_also_without_networks(tmp_path: Path) -> None
     # The torsos are 1.3 and 1.0 of 0.5 to 2.0: a fifth of the range, in one of four lengths.
     assert data["distances"] == [[0.0, 0.1], [0.1, 0.0]]
     assert data["runs"][0]["notes"][0].startswith("No policy and no gradient")
-    assert "Mean distance of the best bodies of 2 runs: 0.10" in (tmp_path / "atlas.html").read_text()
+    assert "In 1 of 2 runs the best body is one that all runs were given" in (tmp_path / "atlas.html").read_text()
 
 
 def test_bodies_that_agree_are_told_from_chance() -> None:
     low, high = np.zeros(4), np.ones(4)
-    assert "more alike than chance" in alike.in_words(alike.distances(np.full((5, 4), 0.5), low, high), 4)
+    same = alike.in_words(alike.distances(np.full((5, 4), 0.5), low, high), 4, ["optimised"] * 5)
+    assert same.startswith("Mean distance of the best bodies of 5 runs: 0.00")
+    assert "more alike than chance" in same
     corners = np.array([[0, 0, 0, 0], [1, 1, 1, 1.0]])
-    assert "less alike than chance" in alike.in_words(alike.distances(corners, low, high), 4)
+    assert "less alike than chance" in alike.in_words(alike.distances(corners, low, high), 4, ["optimised", "random"])
     assert alike.mean_distance(alike.distances(corners, low, high)) == 1
+
+
+def test_bodies_that_every_run_was_given_are_no_agreement() -> None:
+    table = alike.distances(np.array([[0.5] * 4] * 3 + [[1.0] * 4]), np.zeros(4), np.ones(4))
+    said = alike.in_words(table, 4, ["first", "first", "optimised", "random"])
+    assert said.startswith("In 2 of 4 runs the best body is one that all runs were given. Mean distance")
+    assert "best bodies of 2 runs: 0.50" in said
+    said = alike.in_words(table[:3, :3], 4, ["first", "first", "optimised"])
+    assert said.endswith("Too few remain to say whether what the runs found is more alike than chance.")
 
 
 class Rising(torch.nn.Module):
