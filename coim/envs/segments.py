@@ -119,7 +119,9 @@ class Segments:
             _check_body(drawn, body, [*(geoms[i] for i in own), *body.bodies, *body.sites])
             scaled = tuple(i for i in own if geoms[i].name in self._entries)
             carried = [("geom", i, model.geom_pos[geoms[i].id].copy()) for i in own if i not in scaled]
-            carried += [("site", i, site.pos.copy()) for i, site in enumerate(sites) if site.parent.id == body.id]
+            carried += [
+                ("site", i, model.site_pos[site.id].copy()) for i, site in enumerate(sites) if site.parent.id == body.id
+            ]
             hanging = [i for i, child in enumerate(bodies) if i and child.parent.id == body.id]
             yield _Stretched(
                 entry=entries[0],

@@ -21,7 +21,8 @@ EXACT = 1e-9  # m; a larger error is none of rounding
 CHECKED = 8  # random designs, and corners of the bounds, on which the text is checked
 DIGITS = 12  # after the point: what a fit leaves behind them is rounding
 # Attributes of the file that a design may change. The drawn value stays where none does.
-CHANGING = {"body": ("pos",), "geom": ("pos", "size", "fromto"), "joint": ("pos", "ref")}
+SHAPED = ("pos", "size", "fromto")
+CHANGING = {"body": ("pos",), "geom": SHAPED, "site": SHAPED, "joint": ("pos", "ref")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,18 +159,20 @@ def _changing(
 
 
 def _elements(parent: ET.Element) -> Iterator[ET.Element]:
-    """Walk through bodies with their joints and geoms: joints first, then geoms, then children."""
+    """Walk through bodies with their parts: joints first, then geoms, then sites, then children."""
     yield from (child for child in parent if child.tag in ("joint", "freejoint"))
     yield from parent.findall("geom")
+    yield from parent.findall("site")
     for child in parent.findall("body"):
         yield child
         yield from _elements(child)
 
 
-def _parts(parent: mujoco.MjsBody) -> Iterator[mujoco.MjsBody | mujoco.MjsGeom | mujoco.MjsJoint]:
+def _parts(parent: mujoco.MjsBody) -> Iterator[mujoco.MjsBody | mujoco.MjsGeom | mujoco.MjsJoint | mujoco.MjsSite]:
     """Walk through the same of a specification."""
     yield from parent.joints
     yield from parent.geoms
+    yield from parent.sites
     for child in parent.bodies:
         yield child
         yield from _parts(child)

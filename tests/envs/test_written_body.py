@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
+from two_link_arm import TWO_LINK_ARM
 
+from coim import morph_from_mjcf
 from coim.envs import AntMorph, HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
 from coim.envs.written_body import written_body
 
@@ -29,6 +33,17 @@ def test_numbers_that_no_design_changes_stay_as_they_are_written() -> None:
     assert 'range="-150 0"' in "".join(written.texts)
     thigh = written.texts.index(next(text for text in written.texts if 'geom name="thigh"' in text))
     np.testing.assert_allclose(written.slots[thigh], [0, 0, -0.225, 0, 0, 0])  # half of 0.45 m below the hip
+
+
+def test_a_site_on_a_segment_that_scales_is_written_where_it_moves_to(tmp_path: Path) -> None:
+    path, lower = tmp_path / "arm.xml", '<geom name="lower"'
+    sites = '<site name="hand" pos=".4 0 0"/><site name="palm" fromto=".4 0 0 .4 .1 0" size=".01" type="capsule"/>'
+    path.write_text(TWO_LINK_ARM.replace(lower, sites + lower))
+    arm = morph_from_mjcf(path, {"upper": ["upper"], "lower": ["lower"]}, reward=lambda o, a, n, design: n[..., :1])
+    written = written_body(arm(seed=0))
+    model = mujoco.MjModel.from_xml_string(written.text(np.array([1.0, 1.5])))
+    assert model.site("hand").pos.tolist() == pytest.approx([0.6, 0, 0])
+    assert model.site("palm").pos.tolist() == pytest.approx([0.6, 0.075, 0])  # its middle is stretched about the elbow
 
 
 class Sticky(HopperMorph):

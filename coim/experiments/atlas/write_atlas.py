@@ -19,7 +19,7 @@ from torch import Tensor
 
 from coim.envs import BODIES, MorphEnv
 from coim.experiments.atlas import alike, gains, walkers
-from coim.experiments.atlas.simulator import Simulator, read_simulator
+from coim.experiments.atlas.simulator import FETCH, Simulator, read_simulator
 from coim.experiments.frames import designs_of, rows_of
 from coim.experiments.predictions import prediction_interval
 from coim.experiments.run.atomic_write import dated_file, naming_out, write_whole
@@ -61,7 +61,7 @@ def write_atlas(
     out: Path | None = None,
     body: type[MorphEnv] | None = None,
     mujoco: Path | None = None,
-) -> Path:
+) -> tuple[Path, str]:
     """Write one page that opens from a file, without a network.
 
     Args:
@@ -73,7 +73,7 @@ def write_atlas(
             recorded walks are played.
 
     Returns:
-        The page.
+        The page, and why it does not simulate the robot; an empty word if it does.
 
     Raises:
         ValueError: if there is no folder, one is no run or has no best return yet, their environments differ or are
@@ -92,11 +92,16 @@ def write_atlas(
     runs = [part for record, folder in zip(records, folders) for part in _parts(record, folder, body, len(folders))]
     if not runs:
         raise ValueError(f"{folders[0]} has no best return yet; wait for the first row of its designs.csv")
+    why = walkers.body_table(body(num_runs=1, seed=0))["why"]
+    if not why and simulator is None:
+        why = f"a browser needs MuJoCo for it: {FETCH}, and --mujoco"
+    if not why and not any(run.policies for run in runs):
+        why = "no run has a policy that can be read"
     path = _place(out, folders)
     with naming_out(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, page(f"Atlas of {environment}", body, runs, simulator))
-    return path
+    return path, why
 
 
 def page(title: str, body: type[MorphEnv], runs: Sequence[RunPart], simulator: Simulator | None) -> str:

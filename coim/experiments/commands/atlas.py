@@ -43,4 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from coim.experiments.run.bodies import imported_body
 
         body = imported_body(asked.body)
-        print(write_atlas(asked.folders, out=asked.out, body=body, mujoco=asked.mujoco))
+        path, why = write_atlas(asked.folders, out=asked.out, body=body, mujoco=asked.mujoco)
+        if why:
+            print(f"the page plays recorded walks and simulates none: {why}", file=sys.stderr, flush=True)
+        print(path)

@@ -52,6 +52,27 @@ def test_the_page_has_every_body_its_return_and_a_walk(page: Path, folder: Path)
     assert list(part["policies"]) == ["of all bodies", f"of body {tried[part['best']].number}"]
 
 
+def test_the_command_says_why_a_page_only_plays_recorded_walks(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main([str(folder), "--out", str(tmp_path)])
+    assert (
+        "simulates none: a browser needs MuJoCo for it: npm pack @mujoco/mujoco, and --mujoco"
+        in capsys.readouterr().err
+    )
+    simulated = ["--mujoco", str(package(tmp_path, "@mujoco/mujoco")), "--out", str(tmp_path)]
+    main([str(folder), *simulated])
+    assert "recorded" not in capsys.readouterr().err
+
+    def refuse(body: object) -> None:
+        raise ValueError("geom_friction depends on its design")
+
+    monkeypatch.setattr(walkers, "written_body", refuse)
+    main([str(folder), *simulated])
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "recorded" in line]
+    assert line.endswith("simulates none: geom_friction depends on its design")
+
+
 def test_a_page_fetches_nothing(page: Path) -> None:
     text = page.read_text()
     assert re.findall(r'(?:src|href)="(?!data:)[^"]*"', text) == []
