@@ -447,3 +447,15 @@ def test_the_film_of_the_best_body_is_in_the_page_and_settings_are_folded(tmp_pa
     text = write_report([folder]).read_text()
     assert re.findall(r'src="data:video/mp4;base64,([^"]*)"', text) == [base64.b64encode(b"best").decode()]
     assert re.findall(r"<summary><h2>(.*?)</h2></summary>", text) == ["Settings", "Versions and machine"]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")
+@pytest.mark.usefixtures("undrawn")
+def test_on_a_phone_a_table_scrolls_in_its_box_and_no_number_is_broken_over_lines(tmp_path: Path) -> None:
+    told = {"expected": [None, 1234.5, 1234.5, 1234.5], "deviation": [None, 100.0, 100.0, 100.0]}
+    page = write_report([write_run(tmp_path / "run", [1000.0, 3000.0, 2000.0, 1500.0], told=told, chosen_by="returns")])
+    script = "<script>onload = () => { document.body.style.width = '340px'; document.body.title = "
+    script += "[...document.querySelectorAll('section:not(:has(details)) td')].map(cell => cell.clientHeight).join() }"
+    page.write_text(page.read_text().replace("</body>", f"{script}</script></body>"))
+    (heights,) = re.findall(r'<body [^>]*title="([\d,]+)"', browse(tmp_path, "--dump-dom", page).stdout)
+    assert max(map(int, heights.split(","))) < 40  # pixels: a line has 25
