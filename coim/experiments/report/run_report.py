@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from coim.experiments.report.imagined import imagination
 from coim.experiments.report.page import Section, Table, narrow, page
 from coim.experiments.run.atomic_write import dated_file, naming_out, write_whole
 from coim.experiments.run.records import Record, number, read_records
+from coim.run_folder import policy_path
 
 MOST_OF_A_FILM = 10e6  # bytes; a larger one is not put into the page
 
@@ -47,7 +49,7 @@ def write_report(folders: Sequence[Path], *, out: Path | None = None, body: type
     with mpl.rc_context(FONT):
         sections = sections_of(records, body)
     if len(records) == 1:
-        sections[0] = replace(sections[0], film=film_of_best(folders[0], records[0]))
+        sections[0] = with_film(sections[0], folders[0], records[0], body)
     title = f"{records[0].environment}: {', '.join(record.name for record in records)}"
     path = place_of(out, folders)
     with naming_out(path):
@@ -99,16 +101,24 @@ def best_bodies(record: Record) -> Section:
     return Section(title="Best bodies", notes=states([record]), tables=[*narrow(Table(head=head, rows=rows))])
 
 
-def film_of_best(folder: Path, record: Record) -> str:
-    """The film that ``coim watch`` made of the best body of all runs, in base64; empty without one below 10 MB."""
+def with_film(section: Section, folder: Path, record: Record, body: type[MorphEnv] | None) -> Section:
+    """Add the film that ``coim watch`` made of the best body of all runs, or the commands that bring it here."""
     if record.best.empty:
-        return ""
+        return section
     place = int(record.best["best_return"].argmax())
     run, design = int(record.best.index[place]), int(record.best["design"].iloc[place])
     words = f"design-{design}.mp4"
     films = [folder / "videos" / name for name in (words, f"run-{run}-{words}")]
-    found = [film for film in films if film.is_file() and film.stat().st_size < MOST_OF_A_FILM]
-    return base64.b64encode(found[0].read_bytes()).decode() if found else ""
+    found = [film for film in films if film.is_file()]
+    if found and found[0].stat().st_size < MOST_OF_A_FILM:
+        return replace(section, film=base64.b64encode(found[0].read_bytes()).decode())
+    ours = body is not None and BODIES.get(record.environment) is body  # coim watch asks for the class of another
+    if found or not ours or not policy_path(folder, design).is_file():
+        return section
+    # Films are left to the reader: one takes seconds and OpenGL, and a study has hundreds of pages.
+    watch, report = (shlex.join(["coim", command, str(folder)]) for command in ("watch", "report"))
+    told = f"This page has no film of the best body yet. {watch} makes it, then {report} puts it here."
+    return replace(section, notes=[*section.notes, told])
 
 
 # Columns of the comparison: the name of each, and its text for a run folder. A new column is a line here.

@@ -438,13 +438,21 @@ def browse(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
 
 
-def test_the_film_of_the_best_body_is_in_the_page_and_settings_are_folded(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_the_page_has_the_film_of_the_best_body_or_says_how_to_make_it_and_settings_are_folded(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", [1.0, 3.0, 2.0])
-    assert "<video" not in write_report([folder]).read_text()
+    text = write_report([folder]).read_text()
+    assert "<video" not in text
+    assert "coim watch" not in text  # which needs the policy
+    (folder / "policies").mkdir()
+    (folder / "policies/design-2.pt").touch()
+    told = f"no film of the best body yet. coim watch {folder} makes it, then coim report {folder} puts it here"
+    assert told in write_report([folder]).read_text()
     (folder / "videos").mkdir()
     (folder / "videos/design-1.mp4").write_bytes(b"another")
     (folder / "videos/design-2.mp4").write_bytes(b"best")
     text = write_report([folder]).read_text()
+    assert "coim watch" not in text
     assert re.findall(r'src="data:video/mp4;base64,([^"]*)"', text) == [base64.b64encode(b"best").decode()]
     assert re.findall(r"<summary><h2>(.*?)</h2></summary>", text) == ["Settings", "Versions and machine"]
 
