@@ -79,12 +79,21 @@ def check_bodies(env: MorphEnv, evaluation_env: MorphEnv) -> None:
     ):
         if own != other:
             raise ValueError(f"evaluation_env has {what} {other}, env has {own}; make both alike but for their seeds")
-    if what := _different(env, evaluation_env):
-        raise ValueError(f"evaluation_env has another {what} than env; make both alike but for their seeds")
+    if different := _different(env, evaluation_env):
+        raise ValueError(f"evaluation_env has another {different} than env; make both alike but for their seeds")
 
 
 # Of a compiled body: arguments of a class may change them, such as the lengths of its segments at xi = 1.
-BODY = ("geom_size", "geom_pos", "geom_quat", "geom_friction", "body_pos", "body_quat", "body_mass", "body_inertia")
+BODY: tuple[str, ...] = (
+    "geom_size",
+    "geom_pos",
+    "geom_quat",
+    "geom_friction",
+    "body_pos",
+    "body_quat",
+    "body_mass",
+    "body_inertia",
+)
 BODY += ("jnt_range", "jnt_axis", "jnt_stiffness", "dof_damping", "dof_armature", "actuator_gear", "actuator_ctrlrange")
 
 
