@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 WIDTH = 7.2  # inches: A4 within its margins
@@ -22,8 +22,18 @@ def new_figure(height: float, rows: int = 1, columns: int = 1, *, sharex: bool =
         columns: axes in a line.
         sharex: whether all axes have the same x.
     """
-    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
+    figure = sheet(height)
+    return figure, new_axes(figure, rows, columns, sharex=sharex)
+
+
+def sheet(height: float) -> Figure:
+    """A figure of the page's width without axes; its height is in inches."""
+    return Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
+
+
+def new_axes(figure: FigureBase, rows: int, columns: int, *, sharex: bool = False) -> list[Axes]:
+    """Axes of a figure or of a part of it; see `new_figure`."""
     grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex).ravel().tolist()
     for axes in grid:
         axes.spines[["top", "right"]].set_visible(False)
-    return figure, grid
+    return grid

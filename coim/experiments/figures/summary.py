@@ -3,39 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from coim.experiments.drawing.layout import new_figure
+from coim.experiments.drawing.layout import new_axes, sheet
 from coim.experiments.drawing.palette import GREY
 from coim.experiments.figures.comparisons import INTERVALS
 from coim.experiments.figures.plot import Cells, Plot, missing, with_interval
 from coim.experiments.frames import at, rows_of
 from coim.experiments.predictions import LEVEL
+from coim.experiments.run.records import number
 from coim.experiments.statistics.measures import measures
 from coim.experiments.statistics.retrained import with_retrained
 from coim.experiments.statistics.summary import SUMMARISED, named, summary
 from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import Place, Runs, read_runs
 
-LABELS = {
-    "search_gain": "search_gain: searched\nminus random bodies",
-    "area": "area: mean best return\nof a design",
-    "final": "final: highest\nbest return",
-    "rank_correlation": "rank_correlation of\npredicted and achieved",
-    "coverage": f"coverage of {LEVEL:.0%}\nintervals",
-    "retrained": "retrained: best body,\nfrom scratch",
+TITLES = {
+    "search_gain": "searched minus random bodies\n(mean best return)",
+    "area": "best return of a body\n(mean over bodies)",
+    "final": "best return\nof the best body",
+    "rank_correlation": "predicted and achieved\n(rank correlation, -1 to 1)",
+    "coverage": f"best returns within their\n{LEVEL:.0%} interval (share, 0 to 1)",
+    "retrained": "best body trained anew\nfrom scratch (best return)",
 }
 MARKS = {"search_gain": 0.0, "rank_correlation": 0.0, "coverage": LEVEL}  # dashed lines
 IN_A_LINE = 3
-FLAT, LETTER = 3, 0.06  # names of so many arms fit side by side below a panel; inches of a letter
+PANEL, LETTER, GAP = 1.8, 0.062, 0.05  # inches: a panel's axes, a small letter, and the least between two names
+SMALL = 7.5  # points
 CAPTION = (
-    "Every measure of every arm. Points: runs. Bars: mean over runs and its 95 % bootstrap interval. Dashed: no gain, "
-    "no correlation, and the coverage that is aimed at."
+    "Every measure of every arm. Points: runs. Bars: mean over runs, with its number above, and its 95 % bootstrap "
+    "interval. Dashed: no gain, no correlation, and the share that is aimed at."
 )
 NOTES = (
     "search_gain: mean best return of the bodies that were searched for minus that of random ones. area: mean best "
@@ -63,19 +65,24 @@ def plots(study: Path) -> Iterator[Plot]:
 
 
 def draw(runs: Runs, over: pd.DataFrame, rows: pd.DataFrame) -> Plot:
-    """A panel for each measure that any run has; an environment begins a line of its own."""
-    panels: list[tuple[Place, str] | None] = []
-    for place in runs.places:
-        panels += [(place, name) for name in SUMMARISED if len(of_measure(rows, place, name))]
-        panels += [None] * (-len(panels) % IN_A_LINE)
-    lines = len(panels) // IN_A_LINE
-    longest = max(map(len, rows["arm"])) * LETTER * (rows["arm"].nunique() > FLAT)
-    figure, grid = new_figure((1.9 + longest) * lines, lines, IN_A_LINE)
-    for axes, panel in zip(grid, panels):
-        if panel is None:
+    """A part for each environment, with a panel for each measure that any of its runs has."""
+    upright = not fit_side_by_side(rows["arm"].unique())
+    longest = LETTER * max(map(len, rows["arm"])) * upright
+    panels = {
+        place: names
+        for place in runs.places
+        if (names := [name for name in SUMMARISED if len(of_measure(rows, place, name))])
+    }
+    lines = [math.ceil(len(names) / IN_A_LINE) for names in panels.values()]
+    figure = sheet((2.0 + longest) * sum(lines) + 0.25 * len(panels))
+    parts = figure.subfigures(len(panels), 1, squeeze=False, height_ratios=lines).ravel()
+    for part, count, (place, names) in zip(parts, lines, panels.items()):
+        part.suptitle(", ".join(place), fontweight="bold")
+        grid = new_axes(part, count, IN_A_LINE)
+        for axes, name in zip(grid, names):
+            draw_measure(axes, place, name, over, of_measure(rows, place, name), upright=upright)
+        for axes in grid[len(names) :]:
             axes.remove()
-        else:
-            draw_measure(axes, *panel, over, of_measure(rows, *panel))
     return Plot(
         name="summary",
         figure=figure,
@@ -91,8 +98,19 @@ def of_measure(rows: pd.DataFrame, place: Place, name: str) -> pd.DataFrame:
     return rows[(rows["environment"] == named(place)) & (rows["measure"] == name)].set_index("arm")
 
 
-def draw_measure(axes: Axes, place: Place, name: str, over: pd.DataFrame, rows: pd.DataFrame) -> None:
-    """One measure of the arms that have it: a point for each run, and the mean with its interval."""
+def fit_side_by_side(arms: Sequence[str]) -> bool:
+    """Whether the names of arms, in lines that end at their hyphens, stand below a panel without touching each other.
+
+    Example:
+        >>> fit_side_by_side(["none", "random-bodies", "grounded"]), fit_side_by_side(["none"] * 6)
+        (True, False)
+    """
+    longest = max(len(word) for arm in arms for word in arm.split("-"))
+    return longest * LETTER + GAP <= PANEL / (len(arms) + 0.2)  # the panel begins and ends beside the outer names
+
+
+def draw_measure(axes: Axes, place: Place, name: str, over: pd.DataFrame, rows: pd.DataFrame, *, upright: bool) -> None:
+    """One measure of the arms that have it: a point for each run, and the mean with its interval and its number."""
     for x, arm in enumerate(rows.index):
         values, look = at(over, place, arm)[name].dropna().to_numpy(), arm_named(arm)
         spread = x + np.linspace(-0.22, 0.22, len(values) + 2)[1:-1]
@@ -101,9 +119,14 @@ def draw_measure(axes: Axes, place: Place, name: str, over: pd.DataFrame, rows: 
         axes.hlines(rows["mean"][arm], x - 0.3, x + 0.3, color=look.colour, linewidth=2.5)
     if name in MARKS:
         axes.axhline(MARKS[name], color=GREY, linestyle="--", linewidth=0.8, zorder=0)
-    names = [arm if len(rows) > FLAT else arm.replace("-", "-\n") for arm in rows.index]
-    axes.set_xticks(range(len(rows)), names, fontsize=7, rotation=90 * (len(rows) > FLAT))
-    axes.set(ylabel=LABELS[name], title=", ".join(place), xlim=(-0.6, len(rows) - 0.4))
+    names = [arm if upright else arm.replace("-", "-\n") for arm in rows.index]
+    axes.set_xticks(range(len(rows)), names, fontsize=SMALL, rotation=90 * upright)
+    axes.set(title=TITLES[name], xlim=(-0.6, len(rows) - 0.4))
+    above = axes.secondary_xaxis("top")  # the title then stands over the numbers
+    means = [number(mean, 2) for mean in rows["mean"]]
+    above.set_xticks(range(len(rows)), means, fontsize=SMALL, fontweight="bold", rotation=90 * upright)
+    above.tick_params(length=0)
+    above.spines["top"].set_visible(False)
 
 
 def table(rows: pd.DataFrame) -> list[Cells]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from coim.experiments.figures import summary as figure
 from coim.experiments.figures.write import write_plot
 from coim.experiments.statistics.intervals import interval, mean
 from coim.experiments.statistics.summary import COLUMNS
+from coim.experiments.study.arms import ARMS
 from tests.experiments.made_up_study import check_words, read_table, write_cell
 
 KINDS = ("first", "first", "optimised", "random", "optimised", "random")
@@ -54,8 +56,11 @@ def test_each_environment_has_its_panels_with_the_points_of_the_runs_and_the_int
     check_words([plot])
     assert plot.figure is not None
     axes = plot.figure.axes
-    assert [panel.get_title() for panel in axes] == ["hopper, forward"] * 5 + ["walker, backward"] * 3
-    assert axes[0].get_ylabel().startswith("search_gain")
+    assert [part.get_suptitle() for part in plot.figure.subfigs] == ["hopper, forward", "walker, backward"]
+    names = ["search_gain", "area", "final", "rank_correlation", "coverage", "search_gain", "area", "final"]
+    assert [panel.get_title() for panel in axes] == [figure.TITLES[name] for name in names]
+    assert axes[0].get_title() == "searched minus random bodies\n(mean best return)"
+    assert [label.get_text() for label in axes[0].child_axes[0].get_xticklabels()] == ["32"]  # of 32.5
     assert [label.get_text() for label in axes[0].get_xticklabels()] == ["grounded"]
     points, bar, level = axes[0].collections
     assert sorted(y for _, y in points.get_offsets()) == [20, 45]
@@ -65,6 +70,21 @@ def test_each_environment_has_its_panels_with_the_points_of_the_runs_and_the_int
     assert axes[0].get_xticks().tolist() == [0]
     row = next(row for row in plot.table if row["arm"] == "random-bodies")
     assert math.isnan(float(str(row["coverage"])))
+
+
+@pytest.mark.parametrize("arms", [("none", "random-bodies", "grounded"), tuple(ARMS)[:8]], ids=["three", "eight"])
+def test_names_of_arms_and_their_means_do_not_touch_each_other(tmp_path: Path, arms: tuple[str, ...]) -> None:
+    for arm in arms:
+        write_cell(tmp_path, f"hopper-forward-{arm}-0", [1001, 1002, 1003, 1004])
+    (plot,) = figure.plots(tmp_path)
+    assert plot.figure is not None
+    plot.figure.draw_without_rendering()
+    area = plot.figure.axes[1]
+    assert area.get_title() == figure.TITLES["area"]
+    for labels in (area.get_xticklabels(), area.child_axes[0].get_xticklabels()):
+        boxes = [label.get_window_extent() for label in labels]
+        assert len(boxes) == len(arms)
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
 
 
 def test_a_study_without_a_run_that_is_over_has_no_summary_yet(tmp_path: Path) -> None:
