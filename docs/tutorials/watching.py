@@ -89,6 +89,7 @@ else:
     figure, axes = plt.subplots(figsize=(6, 4.5), layout="constrained")
     axes.imshow(picture)
     axes.axis("off")
+# sphinx_gallery_thumbnail_number = -1
 
 # %%
 # Films and pages
@@ -105,5 +106,3 @@ else:
 #
 #     coim evaluate runs/A --design best --episodes 20     # its return and spread, from other starts
 #     coim export runs/A --design best --to policy.onnx    # for other programs, with the body beside it
-#
-# sphinx_gallery_thumbnail_number = -1

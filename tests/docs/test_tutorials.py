@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -23,6 +24,13 @@ def figures() -> Iterator[None]:
 
 def test_the_site_lists_every_tutorial() -> None:
     assert sorted(runpy.run_path(str(DOCS / "reading_order.py"))["TUTORIALS"]) == [path.stem for path in SCRIPTS]
+
+
+def test_settings_of_the_gallery_stand_in_code_where_they_are_left_out_of_the_page() -> None:
+    blocks = [block for path in SCRIPTS for block in path.read_text().split("\n# %%\n")[1:]]
+    text = [line for block in blocks for line in takewhile(lambda line: line.startswith("#"), block.splitlines())]
+    assert text
+    assert not [line for line in text if "sphinx_gallery_" in line]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
