@@ -59,8 +59,8 @@ def read_root(model: mujoco.MjModel, name: str) -> Root:
         name: name of the class, for the message.
 
     Raises:
-        ValueError: if it is none of the three kinds, has an actuator that is no motor, or moves and has no floor; the
-            message says what is different, and what a body must be.
+        ValueError: if it is none of the three kinds, has an actuator that is no motor, or moves and has no floor that
+            it can touch; the message says what is different, and what a body must be.
     """
     kind = _kind_of(model)
     check = {"planar": _against_planar, "free": _against_free, "fixed": _against_fixed}[kind]
@@ -68,8 +68,8 @@ def read_root(model: mujoco.MjModel, name: str) -> Root:
         raise ValueError(f"{name} has {different}; {RULES[kind]}")
     if (different := next(_against_motors(model), None)) is not None:
         raise ValueError(f"{name} has {different}; {MOTORS}")
-    if kind != "fixed" and find_floor(model) is None:
-        raise ValueError(f"{name} has no floor: no horizontal plane at z = 0 in its world; add a geom of type='plane'")
+    if kind != "fixed":
+        _check_floor(model, name)
     unlimited = (model.jnt_type == HINGE) & (model.jnt_limited == 0)
     return Root(
         kind=kind,
@@ -93,23 +93,63 @@ def find_height(model: mujoco.MjModel) -> int | None:
 
 def find_floor(model: mujoco.MjModel) -> int | None:
     """Return the number of the floor, the first horizontal plane of the world at z = 0, or None if there is none."""
-    flat = np.isclose(np.abs(model.geom_quat[:, [0, 3]]).max(1), 1) & (model.geom_pos[:, 2] == 0)
-    found = np.flatnonzero(flat & (model.geom_type == PLANE) & (model.geom_bodyid == 0))
+    found = _floors(model)
     return int(found[0]) if found.size else None
 
 
 def give_floor(spec: mujoco.MjSpec) -> None:
-    """Give a robot that moves a floor at z = 0, in place, if its file has no plane."""
-    moves = find_height(spec.compile()) is not None
-    if moves and not any(int(geom.type) == PLANE for geom in spec.worldbody.geoms):
+    """Give a robot that moves a floor at z = 0 that it can touch, in place, if its file has no plane."""
+    model = spec.compile()
+    if find_height(model) is not None and not any(int(geom.type) == PLANE for geom in spec.worldbody.geoms):
         plane = mujoco.mjtGeom.mjGEOM_PLANE
-        spec.worldbody.add_geom(name=FLOOR, type=plane, size=[40, 40, 40], contype=1, conaffinity=1)
+        contype, conaffinity = _fitting_bits(model)
+        spec.worldbody.add_geom(name=FLOOR, type=plane, size=[40, 40, 40], contype=contype, conaffinity=conaffinity)
 
 
 def colliding(model: mujoco.MjModel) -> np.ndarray:
     """Return the numbers of the robot's geoms that can touch something, in their order."""
     collides = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
     return np.flatnonzero((model.geom_bodyid > 0) & collides)
+
+
+def _floors(model: mujoco.MjModel) -> np.ndarray:
+    """Return the numbers of the world's horizontal planes at z = 0; a file may have one to look at and one to touch."""
+    flat = np.isclose(np.abs(model.geom_quat[:, [0, 3]]).max(1), 1) & (model.geom_pos[:, 2] == 0)
+    return np.flatnonzero(flat & (model.geom_type == PLANE) & (model.geom_bodyid == 0))
+
+
+def _check_floor(model: mujoco.MjModel, name: str) -> None:
+    """Refuse a robot without a floor, or with one that it would fall through."""
+    floors = _floors(model)
+    if not floors.size:
+        raise ValueError(f"{name} has no floor: no horizontal plane at z = 0 in its world; add a geom of type='plane'")
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        raise ValueError(f"{name} has no contacts and would fall through its floor; delete <flag contact='disable'/>")
+    segments = colliding(model)
+    of_floor, of_segments = (
+        np.stack([model.geom_contype[geoms], model.geom_conaffinity[geoms]], 1) for geoms in (floors, segments)
+    )
+    # MuJoCo lets two geoms touch if the contype of one shares a bit with the conaffinity of the other, or by a <pair>.
+    by_bits = (of_floor[:, None] & of_segments[:, ::-1]).any()
+    pairs = np.stack([model.pair_geom1, model.pair_geom2], 1)
+    by_pair = (np.isin(pairs, floors) & np.isin(pairs[:, ::-1], segments)).any()
+    if not by_bits and not by_pair:
+        contype, conaffinity = _fitting_bits(model)
+        raise ValueError(
+            f"{name} has a floor, {_named(model.geom(floors[0]), floors[0])}, that no segment can touch: its (contype, "
+            f"conaffinity) is {tuple(of_floor[0].tolist())}, and those of the segments are "
+            f"{sorted(set(map(tuple, of_segments.tolist())))}; give the floor contype='{contype}' "
+            f"conaffinity='{conaffinity}'"
+        )
+
+
+def _fitting_bits(model: mujoco.MjModel) -> tuple[int, int]:
+    """Return contype and conaffinity of a floor that each colliding segment of a robot can touch."""
+    segments = colliding(model)
+    contype, conaffinity = (
+        int(np.bitwise_or.reduce(bits[segments])) for bits in (model.geom_conaffinity, model.geom_contype)
+    )
+    return contype, conaffinity
 
 
 def _kind_of(model: mujoco.MjModel) -> Literal["planar", "free", "fixed"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import gymnasium
@@ -66,6 +67,47 @@ def test_what_no_body_can_have_is_named(drawn: str, changed: str, different: str
     model = mujoco.MjModel.from_xml_string(text.replace(drawn, changed))
     with pytest.raises(ValueError, match=f"Hopper has {different}.*; (a planar runner|every actuator|add a geom)"):
         read_root(model, "Hopper")
+
+
+FLOOR = '<geom name="floor"'
+PAIR = '<contact><pair geom1="floor" geom2="foot"/></contact>'
+LOOKED_AT = '<geom type="plane" size="9 9 9" contype="0" conaffinity="0"/>'
+
+
+@pytest.mark.parametrize(
+    ("drawn", "changed", "sentence"),
+    [
+        (FLOOR, f'{FLOOR} contype="0" conaffinity="0"', r"is \(0, 0\), .*\[\(1, 1\)\]; .*contype='1' conaffinity='1'"),
+        (FLOOR, f'{FLOOR} contype="2" conaffinity="4"', r"floor, that no segment can touch: .* is \(2, 4\)"),
+        ("<worldbody>", '<option><flag contact="disable"/></option><worldbody>', "no contacts .*; delete <flag"),
+    ],
+)
+def test_a_floor_that_the_robot_would_fall_through_is_refused(drawn: str, changed: str, sentence: str) -> None:
+    model = mujoco.MjModel.from_xml_string(HOPPER.read_text().replace(drawn, changed, 1))
+    with pytest.raises(ValueError, match=f"Hopper has .*{sentence}"):
+        read_root(model, "Hopper")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        LOOKED_AT + FLOOR,
+        f'{FLOOR} contype="0" conaffinity="1"',
+        f'</worldbody>{PAIR}<worldbody>{FLOOR} contype="0" conaffinity="0"',
+    ],
+)
+def test_a_floor_may_lie_under_one_to_look_at_and_touch_by_one_bit_or_by_a_pair(changed: str) -> None:
+    text = HOPPER.read_text().replace(FLOOR, changed, 1)
+    assert read_root(mujoco.MjModel.from_xml_string(text), "Hopper").kind == "planar"
+
+
+def test_a_floor_that_is_given_carries_a_robot_of_any_bits(tmp_path: Path) -> None:
+    text = re.sub(f"{FLOOR}.*", "", HOPPER.read_text())
+    file = tmp_path / "hopper.xml"
+    file.write_text(text.replace('contype="1" conaffinity="1"', 'contype="2" conaffinity="4"'))
+    env = body_of(str(file))(seed=0)
+    env.rollout(200)
+    assert env.simulations.lowest_point(0) == pytest.approx(0, abs=0.2)  # m; free fall would end 13 m below
 
 
 def test_a_mesh_that_could_touch_the_floor_is_named() -> None:
