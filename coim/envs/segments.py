@@ -136,6 +136,9 @@ def keep_densities(spec: mujoco.MjSpec) -> None:
     """Give the robot densities in place of masses, in place, so that longer segments are heavier.
 
     Otherwise a segment would keep the ``mass`` of its geom, and with ``settotalmass`` the robot its own.
+
+    Raises:
+        ValueError: if a body would have another mass than in its file.
     """
     wanted = spec.compiler.settotalmass
     spec.compiler.settotalmass = -1
@@ -144,13 +147,20 @@ def keep_densities(spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
         if not isnan(geom.mass) and int(geom.type) == CAPSULE:
             radius, half = model.geom_size[geom.id, :2]
-            geom.density = geom.mass / (pi * radius**2 * (2 * half + 4 / 3 * radius))
+            if geom.typeinertia == mujoco.mjtGeomInertia.mjINERTIA_SHELL:
+                geom.density = geom.mass / (4 * pi * radius * (half + radius))  # kg/m2
+            else:
+                geom.density = geom.mass / (pi * radius**2 * (2 * half + 4 / 3 * radius))
             geom.mass = np.nan
         geom.density, geom.mass = geom.density * ratio, geom.mass * ratio
-    if wanted > 0 and abs(spec.compile().body_mass.sum() / wanted - 1) > SAME_MASS:
+    masses, kept = model.body_mass * ratio, spec.compile().body_mass
+    changed = np.flatnonzero(np.abs(kept - masses) > SAME_MASS * masses)
+    if changed.size:
+        body = int(changed[0])
         raise ValueError(
-            f"settotalmass={wanted:g} also scales the <inertial> of a body, which no length can change; give "
-            "densities in place of both"
+            f"body {model.body(body).name!r} weighs {masses[body]:g} kg in its file, and {kept[body]:g} kg once "
+            "masses are densities; no length can change an <inertial>, nor how settotalmass scales it: give densities "
+            "in place of both"
         )
 
 

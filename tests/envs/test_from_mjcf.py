@@ -122,6 +122,13 @@ def test_a_part_that_is_given_by_its_ends_moves_along_and_keeps_its_length(arm_f
     longer = made().simulations.body(np.array([2.0])).compile()
     assert longer.geom("rod").pos.tolist() == pytest.approx([0.5, 0.1, 0.4])
     assert longer.geom("rod").size[1] == pytest.approx(0.05)
+def test_a_shell_of_a_given_mass_weighs_as_in_its_file_and_grows_with_its_surface() -> None:
+    drawn = mujoco.MjSpec.from_string(ARM.replace('mass="2"', 'mass="3" shellinertia="true"'))
+    lamp = 1000 * 4 / 3 * np.pi * 0.02**3
+    keep_densities(drawn)
+    assert drawn.compile().body("upper").mass[0] - lamp == pytest.approx(3)
+    Segments(drawn, {"upper arm": ["upper"]}).stretch(drawn, np.array([2.0]))
+    assert drawn.compile().body("upper").mass[0] - lamp == pytest.approx(3 * (0.5 + 0.03) / (0.25 + 0.03))
 
 
 def test_an_arm_passes_torchrls_checks_and_has_names_bounds_and_first_designs(arm: type[MorphEnv]) -> None:
@@ -185,6 +192,12 @@ def test_a_scale_that_names_no_lengths_gets_a_sentence(arm_file: Path, scale: di
             '<joint name="shoulder"',
             '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="shoulder"',
             "inertial",
+        ),
+        (
+            '<option timestep=".01"/>',
+            '<option timestep=".01"/><compiler settotalmass="9"/><worldbody><body name="box">'
+            '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody>',
+            "body 'box' weighs .* kg in its file, and 1 kg once .*settotalmass",
         ),
         ('<site name="bulb"', '<frame pos="0 0 1"><site name="b2"/></frame><site name="bulb"', "lies in a <frame>"),
         (
