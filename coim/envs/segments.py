@@ -11,7 +11,7 @@ Shapes: D design.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from math import isnan, pi
 
@@ -22,6 +22,7 @@ from coim.envs.root import CAPSULE, HINGE, find_height
 from coim.envs.simulation import start_clearance
 
 Scale = Mapping[str, Sequence[str]]
+CONNECT, WELD = mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD
 SAME_MASS = 1e-9  # largest relative error of a body's mass after its densities were made constant
 
 
@@ -53,13 +54,14 @@ class Segments:
 
     Raises:
         ValueError: if a name is no capsule of the robot or is named twice, a body has capsules of two entries, or its
-            mass or place is given in a way that a length cannot change.
+            mass, its place or what it is connected to is given in a way that a length cannot change.
     """
 
     def __init__(self, drawn: mujoco.MjSpec, scale: Scale) -> None:
         self._entries = _entries_of_geoms(drawn, scale)
         model = drawn.compile()
         self._bodies = list(self._plan(drawn, model, scale))
+        _check_loops(drawn, {geom.parent.id for geom in drawn.geoms if geom.name in self._entries})
         self._clearance = None if find_height(model) is None else start_clearance(model)
 
     def stretch(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
@@ -200,6 +202,33 @@ def _check_body(drawn: mujoco.MjSpec, body: mujoco.MjsBody, parts: Sequence[obje
             f"a part of body {body.name!r} lies in a <frame>; write its place without one, as mujoco.MjSpec.to_xml() "
             "does after compile()"
         )
+
+
+def _check_loops(drawn: mujoco.MjSpec, scaled: Set[int]) -> None:
+    """Refuse a closed chain through a scaled body that has an anchor instead of sites: it would not move."""
+    for equality in drawn.equalities:
+        if equality.type not in (CONNECT, WELD) or equality.objtype != mujoco.mjtObj.mjOBJ_BODY:
+            continue
+        one, other = (_ancestry(drawn, name or "world") for name in (equality.name1, equality.name2))
+        joint = next(body for body in one if body in other)
+        # From one end to the other: what lies further in moves both ends alike.
+        through = [body for body in (*one[: one.index(joint)], *other[: other.index(joint)], joint) if body in scaled]
+        if through:
+            word = "connect" if equality.type == CONNECT else "weld"
+            raise ValueError(
+                f"<{word} body1={equality.name1!r} body2={equality.name2!r}> closes a chain through body "
+                f"{drawn.bodies[through[0]].name!r}, which a design scales, and its anchor would stay; put a site on "
+                "each of the two bodies, which moves with its length, and give site1 and site2 in place of the bodies"
+            )
+
+
+def _ancestry(drawn: mujoco.MjSpec, name: str) -> list[int]:
+    """Return the numbers of a body and of the bodies that it hangs on, up to the world."""
+    body, found = drawn.body(name), []
+    while body is not None:
+        found.append(body.id)
+        body = body.parent
+    return found
 
 
 def _anchor(model: mujoco.MjModel, body: int) -> np.ndarray:

@@ -216,6 +216,32 @@ def test_a_file_that_cannot_be_scaled_gets_a_sentence(tmp_path: Path, drawn: str
         morph_from_mjcf(path, scale, slow)
 
 
+@pytest.mark.parametrize(
+    ("chain", "scaled"),
+    [
+        ('<connect body1="upper" anchor=".5 0 0"/>', "upper"),
+        ('<weld body1="lower"/>', "upper"),  # lower hangs on it
+        ('<connect body1="upper" body2="lower" anchor=".6 .1 0"/>', "lower"),
+    ],
+)
+def test_a_closed_chain_whose_anchor_would_stay_is_refused(tmp_path: Path, chain: str, scaled: str) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.replace("<actuator>", f"<equality>{chain}</equality><actuator>"))
+    with pytest.raises(ValueError, match=f"through body '{scaled}', which a design scales, .*; .* site1 and site2"):
+        morph_from_mjcf(path, {"arm": [scaled]}, slow)
+
+
+def test_a_closed_chain_by_sites_moves_with_the_length_and_one_beside_it_stays() -> None:
+    sites = '<connect site1="bulb" site2="pin"/><connect body1="upper" anchor=".5 0 0"/>'
+    text = ARM.replace("<actuator>", f"<equality>{sites}</equality><actuator>")
+    text = text.replace('<geom name="lower"', '<site name="pin" pos=".1 .1 0"/><geom name="lower"')
+    drawn = mujoco.MjSpec.from_string(text)
+    Segments(drawn, {"lower arm": ["lower"]}).stretch(drawn, np.array([2.0]))
+    model = drawn.compile()
+    assert model.site("pin").pos.tolist() == pytest.approx([0.3, 0.1, 0])  # from 0.2 m to 0.4 m behind the elbow
+    assert model.eq_data[1, :3].tolist() == [0.5, 0, 0]
+
+
 def test_a_file_that_is_not_there_and_bounds_that_leave_an_entry_out_are_refused(arm_file: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no file .*nowhere.xml; give the path"):
         morph_from_mjcf("nowhere.xml", {"upper": ["upper"]}, slow)
