@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import threading
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,34 @@ class _BatchConfig(ctypes.Structure):
     """MuJoCo's ``mjBatchConfig``."""
 
     _fields_ = [("nthread", ctypes.c_int), ("persistent", ctypes.c_ubyte)]
+
+
+class _Silence:
+    """Inside, MuJoCo writes no log.
+
+    The log is the process's. Of threads that are inside together, the first switches it off, the last gives it back.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+        self._chosen_by_user: mujoco.MjLogConfig | None = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._chosen_by_user, off = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+                off.logto_file = off.logto_console = False
+                off.set()
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._chosen_by_user.set()
+
+
+_SILENCE = _Silence()
 
 
 class Simulations:
@@ -73,8 +101,6 @@ class Simulations:
         self._moving = self.state[:, : mujoco.mj_stateSize(self._models[0], int(moving))]
         self._scratch = mujoco.MjData(self._models[0])
         self._height = find_height(self._models[0])
-        self._silence = mujoco.MjLogConfig.get()
-        self._silence.logto_file = self._silence.logto_console = False
 
     def body(self, design: np.ndarray) -> mujoco.MjSpec:
         """Return the body of a design ``[D]``, to compile (a third of a millisecond) or to draw."""
@@ -138,7 +164,7 @@ class Simulations:
         bodies = (ctypes.c_void_p * len(self._models))(*(model._address for model in self._models))
         library.mjb_setModels(batch, bodies)
         states[rows] = self.state[rows]
-        with self._silent():
+        with _SILENCE:
             library.mjb_apply(batch, ids.ctypes.data, len(ids), function, argument, 1)
         self.state[rows] = states[rows]
         return rows[status[rows] != 0]
@@ -190,22 +216,12 @@ class Simulations:
 
     def _step_silently(self, num_steps: int) -> np.ndarray:
         """Step without writing MUJOCO_LOG.TXT to the user's folder; :meth:`step` returns the broken rows instead."""
-        with self._silent():
+        with _SILENCE:
             try:
                 self._batch.step(nstep=num_steps)
             except SimulationError as error:
                 return np.asarray(error.ids)
         return np.empty(0, dtype=np.int64)
-
-    @contextmanager
-    def _silent(self) -> Iterator[None]:
-        """Let MuJoCo write no log."""
-        chosen_by_user = mujoco.MjLogConfig.get()
-        self._silence.set()
-        try:
-            yield
-        finally:
-            chosen_by_user.set()
 
     def _mend(self, failed: np.ndarray) -> np.ndarray:
         """Find the broken rows and start them again; this clears their warnings too."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import mujoco
@@ -91,6 +92,35 @@ def test_the_users_own_logging_is_as_it_was():
     fleet().step(1)
     after = mujoco.MjLogConfig.get()
     assert (after.logto_file, after.logto_console) == (before.logto_file, before.logto_console)
+
+
+def test_threads_that_step_together_are_silent_and_the_last_gives_the_log_back(monkeypatch):
+    first_is_in, second_is_in, first_is_out = (threading.Event() for _ in range(3))
+    seen = []
+
+    def first_step(self: Batch, **kwargs: object) -> None:
+        first_is_in.set()
+        assert second_is_in.wait(10)
+
+    def second_step(self: Batch, **kwargs: object) -> None:
+        second_is_in.set()
+        assert first_is_out.wait(10)
+        seen.append(mujoco.MjLogConfig.get().logto_file)
+
+    def step_first() -> None:
+        one.step(1)
+        first_is_out.set()
+
+    one, other = fleet(num=1), fleet(num=1)
+    thread = threading.Thread(target=step_first)
+    monkeypatch.setattr(Batch, "step", first_step)
+    thread.start()
+    assert first_is_in.wait(10)
+    monkeypatch.setattr(Batch, "step", second_step)
+    other.step(1)
+    thread.join()
+    assert seen == [False]
+    assert mujoco.MjLogConfig.get().logto_file
 
 
 def test_capsules_are_where_the_body_is_as_it_stands():
