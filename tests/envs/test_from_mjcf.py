@@ -122,6 +122,8 @@ def test_a_part_that_is_given_by_its_ends_moves_along_and_keeps_its_length(arm_f
     longer = made().simulations.body(np.array([2.0])).compile()
     assert longer.geom("rod").pos.tolist() == pytest.approx([0.5, 0.1, 0.4])
     assert longer.geom("rod").size[1] == pytest.approx(0.05)
+
+
 def test_a_shell_of_a_given_mass_weighs_as_in_its_file_and_grows_with_its_surface() -> None:
     drawn = mujoco.MjSpec.from_string(ARM.replace('mass="2"', 'mass="3" shellinertia="true"'))
     lamp = 1000 * 4 / 3 * np.pi * 0.02**3
