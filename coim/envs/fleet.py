@@ -332,10 +332,13 @@ class Fleet:
         )
 
     def capsules(self, run: int = 0) -> Tensor:
-        """Return where one row's capsules and spheres are, as it stands now.
+        """Return where one row's parts are, as it stands now; what is no capsule is drawn by several, side by side.
 
         Returns:
-            ``[segments, 7]``: x, y and z of both ends and the radius, in m; the ends of a sphere are its centre.
+            ``[capsules, 7]``: x, y and z of both ends and the radius, in m; the ends of a sphere are its centre.
+
+        Note:
+            Boxes, cylinders and ellipsoids have rounded edges then, and a mesh is the box around it.
         """
         return torch.from_numpy(self.simulations.capsules(run))
 

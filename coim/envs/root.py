@@ -18,6 +18,7 @@ import numpy as np
 FREE, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "SLIDE", "HINGE"))
 PLANE, SPHERE, CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE"))
 ELLIPSOID, CYLINDER, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("ELLIPSOID", "CYLINDER", "BOX"))
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 FLOOR = "floor"  # name of the floor of a file that has none
 PLANAR = (("slide along x", SLIDE, (1, 0, 0)), ("slide along z", SLIDE, (0, 0, 1)), ("hinge about y", HINGE, (0, 1, 0)))
 SEGMENTS = "spheres, capsules, cylinders, boxes and ellipsoids as its segments"

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from coim.envs.rods import DRAWN, rods_of
 from coim.envs.root import BOX, CAPSULE, CYLINDER, ELLIPSOID, FREE, SPHERE, colliding, find_height
 
 BEYOND_PHYSICS = 1e6  # m, rad, m/s, rad/s: far beyond any working body; MuJoCo itself warns only from 1e10 on
@@ -196,16 +197,18 @@ class Simulations:
         return lowest_point(model, data)
 
     def capsules(self, row: int) -> np.ndarray:
-        """Return where the robot's capsules and spheres are.
+        """Return where the robot's parts are, as capsules, see `coim.envs.rods`.
 
         Returns:
-            Both ends and the radius in m, ``[segments, 7]``; the ends of a sphere are its centre.
+            Both ends and the radius in m, ``[capsules, 7]``; the ends of a sphere are its centre.
         """
         model, data = self._posed(row)
-        shown = (model.geom_type == CAPSULE) | (model.geom_type == SPHERE)
-        centre, axis = data.geom_xpos[shown], data.geom_xmat[shown][:, [2, 5, 8]]
-        radius, half = model.geom_size[shown, :1], model.geom_size[shown, 1:2]
-        return np.hstack([centre - half * axis, centre + half * axis, radius])
+        drawn = []
+        for part in np.flatnonzero((model.geom_bodyid > 0) & np.isin(model.geom_type, DRAWN)).tolist():
+            own, turn = rods_of(model, part), data.geom_xmat[part].reshape(3, 3)
+            start, end = (data.geom_xpos[part] + own[:, at : at + 3] @ turn.T for at in (0, 3))
+            drawn.append(np.hstack([start, end, own[:, 6:]]))
+        return np.vstack(drawn) if drawn else np.zeros((0, 7))
 
     def _posed(self, row: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return the body of a row, and its frames in its present pose."""

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch, SimulationError
 
+from coim.envs.rods import rods
+from coim.envs.root import BOX, CYLINDER, ELLIPSOID
 from coim.envs.simulation import Simulations
 
 PENDULUM = """
@@ -128,6 +130,34 @@ def test_capsules_are_where_the_body_is_as_it_stands():
     simulations.qpos[0] = np.pi / 2  # swung up to the side of -x
     ends = simulations.capsules(0)
     np.testing.assert_allclose(ends, [[-1, 0, 2, 0, 0, 2, 0.05]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "size"), [(BOX, [0.2, 0.3, 0.1]), (ELLIPSOID, [0.1, 0.3, 0.2])])
+def test_rods_fill_a_part_and_do_not_leave_it(kind: int, size: list[float]):
+    drawn = rods(kind, np.array(size))
+    reach = np.maximum(np.abs(drawn[:, :3]), np.abs(drawn[:, 3:6])) + drawn[:, 6:]
+    np.testing.assert_allclose(reach.max(0), size, atol=1e-12)
+    assert len(drawn) > 1
+
+
+def test_a_long_cylinder_is_one_rod_and_a_disc_is_several():
+    np.testing.assert_allclose(rods(CYLINDER, np.array([0.1, 0.5, 0.0])), [[0, 0, -0.4, 0, 0, 0.4, 0.1]])
+    disc = rods(CYLINDER, np.array([0.5, 0.1, 0.0]))
+    assert disc[0, 3:6].tolist() == pytest.approx([0.4, 0, 0])
+    assert (np.hypot(disc[:, 3], disc[:, 4]) <= 0.5).all()
+
+
+def test_a_mesh_is_drawn_as_the_box_around_it_and_the_world_is_not_drawn():
+    corners = " ".join(f"{x} {y} {z}" for x in (2, 3) for y in (0, 0.2) for z in (0, 0.3))
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><asset><mesh name="brick" vertex="{corners}"/></asset><worldbody>
+        <geom type="box" size="1 1 .1"/><body><joint/><geom type="mesh" mesh="brick"/></body></worldbody></mujoco>"""
+    )
+    simulations = Simulations(spec, shape_body=lambda spec, design: None, designs=np.ones((1, 1)), num_threads=1)
+    drawn = simulations.capsules(0)
+    ends, radius = np.vstack([drawn[:, :3], drawn[:, 3:6]]), drawn[0, 6]
+    found = [ends.min(0) - radius, ends.max(0) + radius]
+    np.testing.assert_allclose(found, [[2, 0, 0], [3, 0.2, 0.3]], atol=1e-6)
 
 
 def test_lifting_moves_a_body_out_of_the_floor_and_leaves_others_alone():

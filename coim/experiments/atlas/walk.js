@@ -3,7 +3,8 @@
 
 const TURN = 2 * Math.PI;
 const BEYOND_PHYSICS = 1e6; // as coim.envs.simulation: a simulation with such a number is broken
-const SPHERE = 2, CAPSULE = 3, ELLIPSOID = 4, CYLINDER = 5, BOX = 6; // MuJoCo's types of geoms
+const SPHERE = 2, CAPSULE = 3, ELLIPSOID = 4, CYLINDER = 5, BOX = 6, MESH = 7; // MuJoCo's types of geoms
+const FLATTEST = 7, OVERLAP = 1.5; // as coim.envs.rods
 
 const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 const floats = (base64) => new Float32Array(bytes(base64).buffer);
@@ -76,6 +77,36 @@ function lowestPoint(mujoco, model, data) {
   return lowest;
 }
 
+// Capsules that draw a part in its own axes: coim.envs.rods.rods.
+function rods(type, size) {
+  if (type === SPHERE || type === CAPSULE) {
+    const half = type === CAPSULE ? size[1] : 0;
+    return [[0, 0, -half, 0, 0, half, size[0]]];
+  }
+  const sides = type === CYLINDER ? [size[0], size[0], size[1]] : size;
+  const [along, across, thin] = [0, 1, 2].sort((one, other) => sides[other] - sides[one]);
+  const radius = Math.max(sides[thin], sides[across] / FLATTEST), reach = sides[across] - radius;
+  const steps = Math.ceil(reach / (OVERLAP * radius) - 1e-9);
+  const places = [0];
+  for (let k = 1; k <= steps; k++) places.push((-reach * k) / steps, (reach * k) / steps);
+  const round = type === ELLIPSOID || (type === CYLINDER && thin === 2);
+  return places.map((place) => {
+    const length = sides[along] * (round ? Math.sqrt(1 - (place / sides[across]) ** 2) : 1);
+    const rod = [0, 0, 0, 0, 0, 0, radius];
+    rod[3 + along] = Math.max(length - radius, 0);
+    rod[along] = -rod[3 + along];
+    rod[across] = rod[3 + across] = place;
+    return rod;
+  });
+}
+
+// Those of one part of a model; a mesh is the box around it.
+function rodsOf(model, i) {
+  if (model.geom_type[i] !== MESH) return rods(model.geom_type[i], [...model.geom_size.slice(3 * i, 3 * i + 3)]);
+  const box = [...model.geom_aabb.slice(6 * i, 6 * i + 6)];
+  return rods(BOX, box.slice(3)).map((rod) => rod.map((value, at) => (at < 6 ? value + box[at % 3] : value)));
+}
+
 // A body that is simulated: any design, driven by a policy.
 class Simulation {
   constructor(mujoco, body, policy, design) {
@@ -111,7 +142,9 @@ class Simulation {
       this.model.delete();
       this.data.delete();
     }
-    const shown = [...model.geom_type.keys()].filter((i) => model.geom_type[i] === SPHERE || model.geom_type[i] === CAPSULE);
+    const shown = [...model.geom_type.keys()]
+      .filter((i) => model.geom_bodyid[i] > 0 && [SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH].includes(model.geom_type[i]))
+      .flatMap((i) => rodsOf(model, i).map((rod) => ({ i, rod })));
     const range = model.actuator_ctrlrange;
     const motors = Array.from({ length: model.nu }, (_, i) => [range[2 * i], range[2 * i + 1]]);
     Object.assign(this, { model, data, design, shown, motors });
@@ -142,11 +175,10 @@ class Simulation {
   }
 
   capsules() {
-    const { geom_size: size } = this.model, { geom_xpos: place, geom_xmat: turn } = this.data;
-    return this.shown.map((i) => {
-      const half = this.model.geom_type[i] === CAPSULE ? size[3 * i + 1] : 0;
-      const end = (sign) => [0, 1, 2].map((axis) => place[3 * i + axis] + sign * half * turn[9 * i + 3 * axis + 2]);
-      return [...end(-1), ...end(1), size[3 * i]];
+    const { geom_xpos: place, geom_xmat: turn } = this.data;
+    return this.shown.map(({ i, rod }) => {
+      const moved = (at) => [0, 1, 2].map((axis) => [0, 1, 2].reduce((sum, own) => sum + turn[9 * i + 3 * axis + own] * rod[at + own], place[3 * i + axis]));
+      return [...moved(0), ...moved(3), rod[6]];
     });
   }
 }

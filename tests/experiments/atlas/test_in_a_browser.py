@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDict
 from tiny_runs import run
 
-from coim import load_run
+from coim import load_run, morph_from_mjcf
 from coim.envs import AntMorph, HalfCheetahMorph, HopperMorph, MorphEnv, WalkerMorph
 from coim.envs.camera import drawn_axes
 from coim.experiments.atlas.walkers import body_table
@@ -187,6 +187,33 @@ def test_a_step_of_the_page_is_one_of_the_environment(walking: Any, body: type[M
         STEPS,
     )
     np.testing.assert_allclose(found, torch.cat(wanted), rtol=0, atol=1e-5)  # single precision there, double here
+
+
+PARTS = """
+<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 .2 0 0 0 .3"/></asset><worldbody>
+  <body name="trunk" pos="0 0 1"><freejoint/>
+    <geom type="box" size=".2 .3 .05" euler="10 20 30"/>
+    <geom type="ellipsoid" size=".1 .3 .2" pos=".5 0 0"/>
+    <geom type="cylinder" size=".3 .1" pos="-.5 0 0"/>
+    <geom type="mesh" mesh="m" contype="0" conaffinity="0"/>
+    <body name="leg"><joint name="hip" axis="0 1 0"/>
+      <geom name="leg" type="capsule" fromto="0 0 0 0 0 -.5" size=".04"/></body>
+  </body></worldbody>
+  <actuator><motor joint="hip" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@simulated
+def test_the_page_draws_every_shape_as_python_does(walking: Any, tmp_path: Path) -> None:
+    (tmp_path / "parts.xml").write_text(PARTS)
+    body = morph_from_mjcf(tmp_path / "parts.xml", {"leg": ["leg"]}, reward=lambda o, a, n, design: n[..., :1])
+    env = body(num_runs=1, reset_noise=0, seed=0)
+    env.reset()
+    found = walking.execute_script(
+        "return new Simulation(shown.mujoco, arguments[0], null, [1]).capsules();", body_table(env)
+    )
+    np.testing.assert_allclose(found, env.capsules(), rtol=0, atol=1e-6)
 
 
 @simulated
