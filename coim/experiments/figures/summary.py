@@ -66,7 +66,7 @@ def plots(study: Path) -> Iterator[Plot]:
 
 def draw(runs: Runs, over: pd.DataFrame, rows: pd.DataFrame) -> Plot:
     """A part for each environment, with a panel for each measure that any of its runs has."""
-    upright = not fit_side_by_side(rows["arm"].unique())
+    upright = not fit_side_by_side(rows["arm"].unique().tolist())
     longest = LETTER * max(map(len, rows["arm"])) * upright
     panels = {
         place: names
