@@ -27,6 +27,7 @@ from coim.imagination import Actions, check_options, imagine
 from coim.learners.dynamics import DynamicsLearner
 from coim.models.ensemble import GaussianEnsemble
 from coim.pairs import StatesAre, impossible_pairs
+from coim.randomness import GLOBAL_GENERATORS
 
 TRIES = 16  # draws of G from each design that is tried
 
@@ -249,7 +250,7 @@ def _check_generator(env: MorphEnv, generator: DesignGenerator, first_designs: T
     low, high = env.design_spec.space.low, env.design_spec.space.high
     tried = torch.cat([first_designs.flatten(0, -2), low[None], high[None]]).repeat(TRIES, 1)
     tried = tried.unsqueeze(1).expand(-1, env.batch_size.numel(), -1)  # [N, K, D]
-    with torch.random.fork_rng(devices=[tried.device] if tried.device.type == "cuda" else []):
+    with GLOBAL_GENERATORS, torch.random.fork_rng(devices=[tried.device] if tried.device.type == "cuda" else []):
         found = generator(tried.clone(), rng=torch.Generator(tried.device).manual_seed(0))
     if found.shape != tried.shape:
         raise ValueError(

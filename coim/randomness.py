@@ -7,6 +7,7 @@ References:
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal, get_args
@@ -27,6 +28,9 @@ Stream = Literal[
     "imagined individual",
 ]
 """Everything that Algorithm 1 draws: actions, imagination, random designs, and the rows of each learner's batches."""
+
+GLOBAL_GENERATORS = threading.RLock()
+"""Held while torch's global generators, which are the process's, are changed for a while and then restored."""
 
 
 def stream(name: Stream, seed: int, device: torch.device | str = "cpu") -> torch.Generator:
@@ -78,19 +82,24 @@ def restore_generator(generator: torch.Generator, state: Tensor) -> None:
 def drawing_from(rng: torch.Generator | None, device: torch.device) -> Iterator[None]:
     """Let modules that can only draw from torch's global generator draw reproducibly, and leave it as it was.
 
-    TorchRL's distributions take no generator.
+    TorchRL's distributions take no generator. One thread at a time is inside: what it replaces is the process's, as is
+    TorchRL's exploration type, which is set inside.
 
     Args:
         rng: gives the seed; None lets them draw from the global generator.
         device: on which they draw.
+
+    Note:
+        Another thread that draws from the global generator without this gets these numbers, and changes them.
     """
-    if rng is None:
-        yield
-        return
-    shared = torch.default_generator if device.type == "cpu" else torch.cuda.default_generators[device.index or 0]
-    before = shared.get_state()
-    shared.manual_seed(int(torch.randint(2**62, (), generator=rng, device=rng.device)))
-    try:
-        yield
-    finally:
-        shared.set_state(before)
+    with GLOBAL_GENERATORS:
+        if rng is None:
+            yield
+            return
+        shared = torch.default_generator if device.type == "cpu" else torch.cuda.default_generators[device.index or 0]
+        before = shared.get_state()
+        shared.manual_seed(int(torch.randint(2**62, (), generator=rng, device=rng.device)))
+        try:
+            yield
+        finally:
+            shared.set_state(before)

@@ -11,6 +11,8 @@ from torchrl.data import TensorSpec
 from torchrl.envs import AsyncEnvPool, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
+from coim.randomness import GLOBAL_GENERATORS
+
 
 def body_of(env: EnvBase) -> tuple[EnvBase, bool]:
     """Find the environment inside of transforms and of `SerialEnv`, `ParallelEnv` or `AsyncEnvPool`.
@@ -30,7 +32,7 @@ def body_of(env: EnvBase) -> tuple[EnvBase, bool]:
         transforms = [part for part in env.transform.modules() if isinstance(part, Transform)]
         return body, rewritten or any("observation" in transform.out_keys for transform in transforms)
     if isinstance(env, BatchedEnvBase | AsyncEnvPool):
-        with torch.random.fork_rng(devices=[]):
+        with GLOBAL_GENERATORS, torch.random.fork_rng(devices=[]):
             workers = [body_of(worker) for worker in _workers(env)]
         kinds = {(type(body).__name__, "rewritten" if rewritten else "bare") for body, rewritten in workers}
         if len(kinds) > 1:
