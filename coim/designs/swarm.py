@@ -12,6 +12,7 @@ References:
 from __future__ import annotations
 
 import logging.config
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -25,6 +26,8 @@ from torchrl.data import Bounded
 from .bounds import bounds_of
 from .search import Fitness, evaluate
 
+_PROCESS_WIDE = threading.Lock()  # held while numpy's global state or the logging configuration is replaced
+
 
 @contextmanager
 def _no_reports() -> Iterator[None]:
@@ -32,7 +35,7 @@ def _no_reports() -> Iterator[None]:
 
     All of its modules and handlers make a reporter that does so, at import or when they are made.
     """
-    with mock.patch.object(logging.config, "dictConfig"):
+    with _PROCESS_WIDE, mock.patch.object(logging.config, "dictConfig"):
         yield
 
 
@@ -72,7 +75,8 @@ class ParticleSwarm:
 
     Note:
         The swarm replaces numpy's global state while it moves. Another thread that draws from it at that time gets
-        the swarm's numbers. During ``fitness``, the global state is the caller's.
+        the swarm's numbers; swarms of several threads move one at a time. During ``fitness``, the global state is the
+        caller's.
 
     Example:
         >>> search = ParticleSwarm(Bounded(low=0.8, high=2.0, shape=(2,)), num_particles=50, num_iterations=60, seed=0)
@@ -152,10 +156,11 @@ class ParticleSwarm:
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
         """Replace numpy's global state by the swarm's, and restore it at the end."""
-        outside = np.random.get_state()  # noqa: NPY002
-        np.random.set_state(self._random_state)  # noqa: NPY002
-        try:
-            yield
-        finally:
-            self._random_state = np.random.get_state()  # noqa: NPY002
-            np.random.set_state(outside)  # noqa: NPY002
+        with _PROCESS_WIDE:
+            outside = np.random.get_state()  # noqa: NPY002
+            np.random.set_state(self._random_state)  # noqa: NPY002
+            try:
+                yield
+            finally:
+                self._random_state = np.random.get_state()  # noqa: NPY002
+                np.random.set_state(outside)  # noqa: NPY002

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import logging
+import logging.config
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -93,6 +95,23 @@ def test_the_swarm_leaves_numpy_logging_and_the_working_directory_alone(
     assert (list(logging.root.handlers), logging.root.level) == (handlers, level)
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
+
+
+def test_swarms_in_threads_find_what_each_finds_alone_and_give_numpy_and_logging_back() -> None:
+    def found(seed: int) -> float:
+        return ParticleSwarm(SPEC, num_particles=10, num_iterations=100, seed=seed).maximise(bowl)[1]
+
+    alone, configure = [found(seed) for seed in range(4)], logging.config.dictConfig
+    state, often = np.random.get_state()[1].copy(), sys.getswitchinterval()  # noqa: NPY002
+    sys.setswitchinterval(1e-6)  # s; threads take turns within a move
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            together = list(threads.map(found, range(4)))
+    finally:
+        sys.setswitchinterval(often)
+    assert together == alone
+    assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
+    assert logging.config.dictConfig is configure
 
 
 def test_numpy_is_given_back_when_the_fitness_fails() -> None:
