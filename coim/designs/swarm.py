@@ -147,7 +147,8 @@ class ParticleSwarm:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the random numbers from :meth:`state_dict`."""
         # The last two entries hold a normal number kept for the next draw; only uniform numbers are drawn here.
-        self._random_state = ("MT19937", state_dict["key"].numpy().astype(np.uint32), state_dict["position"], 0, 0.0)
+        key = state_dict["key"].cpu().numpy().astype(np.uint32)
+        self._random_state = ("MT19937", key, state_dict["position"], 0, 0.0)
 
     def _candidates(self, position: np.ndarray) -> Tensor:
         """Convert pyswarms' float64 positions to designs, ``[*B, D]``, exactly inside the bounds."""

@@ -139,6 +139,22 @@ def test_searches_go_on_in_their_own_random_numbers_and_a_checkpoint_goes_on_too
     assert resumed.maximise(bowl)[1] == value
 
 
+def test_a_checkpoint_may_have_been_loaded_onto_another_device() -> None:
+    class Elsewhere(torch.Tensor):
+        """Stands in for a tensor on a GPU, which numpy cannot read."""
+
+        def cpu(self) -> Tensor:
+            return self.as_subclass(Tensor)
+
+        def numpy(self) -> np.ndarray:
+            raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    saved, resumed = (ParticleSwarm(SPEC, num_particles=10, num_iterations=5, seed=seed) for seed in (3, 4))
+    state = saved.state_dict()
+    resumed.load_state_dict(state | {"key": state["key"].as_subclass(Elsewhere)})
+    assert resumed.maximise(bowl)[1] == saved.maximise(bowl)[1]
+
+
 @pytest.mark.parametrize("broken", [float("nan"), float("inf")])
 def test_a_fitness_that_is_not_finite_is_named(broken: float) -> None:
     def fitness(designs: Tensor) -> Tensor:
