@@ -42,7 +42,7 @@ class _Silence:
 
     def __init__(self) -> None:
         self._lock, self._inside = threading.Lock(), 0
-        self._chosen_by_user: mujoco.MjLogConfig | None = None
+        self._chosen_by_user = mujoco.MjLogConfig.get()
 
     def __enter__(self) -> None:
         with self._lock:
