@@ -7,6 +7,7 @@ knows the bodies, such as ``coim/Hopper-v0``, when both are imported, in either 
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 # First, before TorchRL imports mujoco itself: a missing OpenGL library is then said in one sentence.
@@ -178,3 +179,7 @@ __all__ = [
     "select_run",
     "transition_rows",
 ]
+
+if find_spec("botorch") is None:  # it is optional, and "import *" asks for every name
+    __all__.remove("DesignPosterior")
+    __all__.remove("PosteriorChoice")

@@ -39,6 +39,19 @@ def test_what_needs_a_missing_package_names_it(name: str, missing: str) -> None:
     assert missing in said
 
 
+@pytest.mark.parametrize("package", ["coim", "coim.designs"])
+def test_without_an_optional_package_only_its_names_are_missing_and_say_what_to_install(package: str) -> None:
+    lines = [f"import sys, inspect; sys.modules.update(botorch=None)\nimport {package} as package"]
+    lines += [f"from {package} import *", "GradientSearch", "assert not hasattr(package, 'DesignPosterior')"]
+    lines += ["assert 'GradientSearch' in dict(inspect.getmembers(package))", "errors = []"]
+    lines += ["try: package.DesignPosterior\nexcept AttributeError as error: errors.append(str(error))"]
+    lines += [f"try: from {package} import DesignPosterior\nexcept ImportError as error: errors.append(str(error))"]
+    lines += ["print(*errors, sep='\\n')"]
+    result = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    said = "DesignPosterior needs BoTorch, which is optional: pip install 'coim[posterior]'"
+    assert result.stdout.splitlines() == [said, said]
+
+
 @PACKAGES
 def test_every_public_name_is_there_and_is_the_one_that_type_checkers_see(package: str) -> None:
     module = importlib.import_module(package)

@@ -6,6 +6,7 @@ A generator is a callable ``(design, *, rng=None) -> design`` (:class:`DesignGen
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from coim.lazy import lazy_names
@@ -41,3 +42,6 @@ __all__ = [
     "RandomDesigns",
     "TrustRegion",
 ]
+
+if find_spec("botorch") is None:  # it is optional, and "import *" asks for every name
+    __all__.remove("DesignPosterior")
