@@ -33,20 +33,13 @@ def lazy_names(
 
     Returns:
         Functions to be assigned to ``__getattr__`` and ``__dir__``. The first raises AttributeError for an unknown
-        name, and for one whose module needs a package that is missing, in the words of its ImportError: ``hasattr`` is
-        False then. ``from package import name`` raises the ImportError itself.
+        name, and whatever the module raises that it imports.
     """
     home_of = {name: module for module, names in homes.items() for name in names}
-    names = _Names(package, home_of)
 
     def getattribute(name: str) -> Any:
         if name in home_of:
-            try:
-                value = names.load(name)
-            except ImportError as error:
-                if names not in sys.meta_path:
-                    sys.meta_path.append(names)
-                raise _NotInstalledError(error) from error
+            value = getattr(import_module(f"{package}.{home_of[name]}"), name)
         elif not name.startswith("_") and find_spec(f"{package}.{name}") is not None:
             value = import_module(f"{package}.{name}")
         else:
@@ -58,38 +51,6 @@ def lazy_names(
         return sorted({*vars(sys.modules[package]), *home_of})
 
     return getattribute, directory
-
-
-class _NotInstalledError(AttributeError):
-    """A name whose module needs a package that is missing; ``reason`` is the error of its import."""
-
-    def __init__(self, reason: ImportError) -> None:
-        super().__init__(str(reason))
-        self.reason = reason
-
-
-class _Names(MetaPathFinder):
-    """The names of a package; finds no module, but says why a name cannot be imported.
-
-    After an AttributeError, ``from package import name`` looks for a module of that name. Where there is none, it would
-    only say that it cannot import the name.
-    """
-
-    def __init__(self, package: str, home_of: Mapping[str, str]) -> None:
-        self._package, self._home_of = package, home_of
-
-    def load(self, name: str) -> Any:
-        """Return what has the name, or raise the ImportError of its module."""
-        try:
-            return getattr(import_module(f"{self._package}.{self._home_of[name]}"), name)
-        except _NotInstalledError as error:  # its home is a package of this kind
-            raise error.reason from None
-
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> None:
-        """None, or the ImportError of the name."""
-        package, _, name = fullname.rpartition(".")
-        if package == self._package and name in self._home_of:
-            self.load(name)
 
 
 def when_imported(module: str, call: Callable[[], None]) -> None:

@@ -40,16 +40,17 @@ def test_what_needs_a_missing_package_names_it(name: str, missing: str) -> None:
 
 
 @pytest.mark.parametrize("package", ["coim", "coim.designs"])
-def test_without_an_optional_package_only_its_names_are_missing_and_say_what_to_install(package: str) -> None:
-    lines = [f"import sys, inspect; sys.modules.update(botorch=None)\nimport {package} as package"]
-    lines += [f"from {package} import *", "GradientSearch", "assert not hasattr(package, 'DesignPosterior')"]
-    lines += ["assert 'GradientSearch' in dict(inspect.getmembers(package))", "errors = []"]
-    lines += ["try: package.DesignPosterior\nexcept AttributeError as error: errors.append(str(error))"]
-    lines += [f"try: from {package} import DesignPosterior\nexcept ImportError as error: errors.append(str(error))"]
-    lines += ["print(*errors, sep='\\n')"]
+def test_without_an_optional_package_all_other_names_can_be_had(package: str) -> None:
+    lines = [
+        "import sys; sys.modules.update(botorch=None)",
+        f"from {package} import *",
+        "GradientSearch",
+        "wanted = ''",
+    ]
+    lines += [f"try: from {package} import DesignPosterior\nexcept ImportError as error: wanted = str(error)"]
+    lines += ["print(wanted)"]
     result = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
-    said = "DesignPosterior needs BoTorch, which is optional: pip install 'coim[posterior]'"
-    assert result.stdout.splitlines() == [said, said]
+    assert result.stdout == "DesignPosterior needs BoTorch, which is optional: pip install 'coim[posterior]'\n"
 
 
 @PACKAGES
