@@ -9,13 +9,13 @@ Shapes: T steps, K runs, S observation, D design, A action.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from itertools import chain
 
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from coim.envs.fleet import Fleet
@@ -24,11 +24,13 @@ from coim.envs.native_episode import Actor, Rows, play
 from coim.models.policy import LOG_SCALE_RANGE, Policy, PolicyNetwork
 from coim.randomness import drawing_from
 
+Acts = Callable[[TensorDict], TensorDictBase]
+
 
 @torch.no_grad()
 def run_episode(
     env: MorphEnv,
-    policy: TensorDictModuleBase | None,
+    policy: Acts | None,
     *,
     design: Tensor | None = None,
     deterministic: bool = False,
@@ -42,7 +44,8 @@ def run_episode(
     Args:
         env: K bodies in lock-step, without transforms: rows hold what the bodies do, not what a transform makes of it.
         policy: who acts; None draws every action uniformly. A `Policy` that is as it was made acts without TensorDicts,
-            many times faster than any other module that reads ``observation`` and ``design`` and writes ``action``.
+            many times faster than any other module or function of a TensorDict ``[K]`` on the CPU that reads
+            ``observation`` and ``design`` and returns it with ``action``.
         design: ``[K, D]`` bodies to build before the episode; None keeps the present ones.
         deterministic: act with the mode of the policy instead of a sample.
         rng: where the actions' noise comes from; None uses torch's default generator of the CPU. Drawn on the CPU, an
@@ -137,7 +140,7 @@ def _native(env: MorphEnv, network: PolicyNetwork, design: Tensor) -> Actor | No
 
 
 def _called(
-    policy: TensorDictModuleBase, observation: Tensor, design: Tensor, deterministic: bool, rng: torch.Generator | None
+    policy: Acts, observation: Tensor, design: Tensor, deterministic: bool, rng: torch.Generator | None
 ) -> Tensor:
     """The action of any policy, by calling it, ``[K, A]``."""
     seen = TensorDict({"observation": observation, "design": design}, observation.shape[:1])
@@ -146,14 +149,16 @@ def _called(
         return policy(seen)["action"]
 
 
-def _on_cpu(policy: TensorDictModuleBase) -> TensorDictModuleBase:
-    """The policy, or a copy of one that lives elsewhere, whose every action would have to be waited for."""
+def _on_cpu(policy: Acts) -> Acts:
+    """The policy, or a copy of a module that lives elsewhere, whose every action would have to be waited for."""
+    if not isinstance(policy, nn.Module):
+        return policy
     tensors = chain(policy.parameters(), policy.buffers())
     return policy if all(tensor.device.type == "cpu" for tensor in tensors) else deepcopy(policy).cpu()
 
 
 def _noise(
-    steps: int, shape: torch.Size, policy: TensorDictModuleBase | None, deterministic: bool, rng: torch.Generator | None
+    steps: int, shape: torch.Size, policy: Acts | None, deterministic: bool, rng: torch.Generator | None
 ) -> Tensor:
     """What randomness the whole episode needs: uniform actions, standard normal noise, or none, ``[T, K, A]``."""
     if policy is not None and deterministic:

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
+from torchrl.collectors import RandomPolicy
 from torchrl.envs import ExplorationType, ObservationNorm, TransformedEnv, set_exploration_type
 
 from coim import HopperMorph, make_policy, run_episode
@@ -98,6 +99,21 @@ def test_a_policy_that_is_called_draws_from_the_generator_too() -> None:
     assert not torch.equal(first, actions(2))
     assert first.unique().numel() == first.numel()
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_any_function_of_a_tensordict_may_act() -> None:
+    def still(tensordict: TensorDict) -> TensorDict:
+        return tensordict.set("action", 0.25 * torch.ones(2, 3))
+
+    env = HopperMorph(num_runs=2, episode_steps=4, seed=0)
+    assert run_episode(env, still)["action"].unique().tolist() == [0.25]
+    drawn = [
+        run_episode(env, RandomPolicy(env.action_spec), rng=torch.Generator().manual_seed(seed))["action"]
+        for seed in (1, 1, 2)
+    ]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    assert len(drawn[0].unique()) == 4 * 2 * 3
 
 
 def test_only_the_last_row_is_truncated() -> None:
