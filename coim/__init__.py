@@ -180,6 +180,6 @@ __all__ = [
     "transition_rows",
 ]
 
-if find_spec("botorch") is None:  # it is optional, and "import *" asks for every name
+if not TYPE_CHECKING and find_spec("botorch") is None:  # it is optional, and "import *" asks for every name
     __all__.remove("DesignPosterior")
     __all__.remove("PosteriorChoice")

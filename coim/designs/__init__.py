@@ -43,5 +43,5 @@ __all__ = [
     "TrustRegion",
 ]
 
-if find_spec("botorch") is None:  # it is optional, and "import *" asks for every name
+if not TYPE_CHECKING and find_spec("botorch") is None:  # it is optional, and "import *" asks for every name
     __all__.remove("DesignPosterior")
