@@ -14,6 +14,7 @@ import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -87,7 +88,7 @@ class MorphEnv(Fleet, DesignedEnv):
         device: torch.device | str | None = None,
     ) -> None:
         for name, count in (("num_runs", num_runs), ("episode_steps", episode_steps), ("num_threads", num_threads)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            if isinstance(count, bool) or not isinstance(count, Integral) or count < 1:
                 raise ValueError(f"{name} {count!r} is not a whole number of at least 1")
         self.design_names()
         self._check_bounds()
@@ -263,7 +264,7 @@ class MorphEnv(Fleet, DesignedEnv):
     def _check_numbers(self) -> None:
         """Refuse a frame skip, an observation scale or a reward that do not fit the body."""
         name, size, scale = type(self).__name__, self._observation.shape[-1], self.OBSERVATION_SCALE
-        if not isinstance(self.FRAME_SKIP, int) or self.FRAME_SKIP < 1:
+        if not isinstance(self.FRAME_SKIP, Integral) or self.FRAME_SKIP < 1:
             raise ValueError(f"{name}.FRAME_SKIP is {self.FRAME_SKIP}, not a whole number of at least 1")
         if len(scale) not in (size, size + self.first_position) or not all(0 < entry < math.inf for entry in scale):
             raise ValueError(

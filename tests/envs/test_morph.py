@@ -373,6 +373,14 @@ def test_a_bad_argument_gets_a_sentence(body, arguments, sentence):
         body(**arguments)
 
 
+def test_counts_may_be_numpys():
+    class Skipping(HopperMorph):
+        FRAME_SKIP = np.int64(2)
+
+    env = Skipping(num_runs=np.int64(2), episode_steps=np.int64(3), num_threads=np.int64(2))
+    assert env.rollout(5).shape == (2, 3)
+
+
 @BODIES
 def test_each_entry_of_a_design_has_a_name_from_the_bodys_table(body):
     names = body.design_names()
