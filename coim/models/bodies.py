@@ -71,9 +71,15 @@ def design_bounds(env: EnvBase) -> tuple[Tensor, Tensor, Tensor]:
         Lowest design, highest design, and which entries have both bounds, each ``[D]``.
 
     Raises:
-        ValueError: if the bounds are not the same in all rows of the environment.
+        ValueError: if it has neither, or the bounds are not the same in all rows of the environment.
     """
-    spec = env.observation_spec["design"] if "design" in env.observation_spec.keys() else env.design_spec  # noqa: SIM118
+    if "design" in env.observation_spec.keys():  # noqa: SIM118
+        spec = env.observation_spec["design"]
+    elif (spec := getattr(env, "design_spec", None)) is None:
+        raise ValueError(
+            f"{type(env).__name__} has no designs, neither 'design' in its observation_spec nor a design_spec; take a "
+            "MorphEnv such as HopperMorph, its dream, or one of these inside of transforms or of several workers"
+        )
     low, high = (bound.reshape(-1, spec.shape[-1]) for bound in (spec.space.low, spec.space.high))
     if not ((low == low[0]).all() and (high == high[0]).all()):
         raise ValueError(f"designs have other bounds in other rows, {low.tolist()} to {high.tolist()}; make them alike")

@@ -134,8 +134,8 @@ class GaussianEnsemble(TensorDictModuleBase):
             num_runs: ``K``, or None for a single run.
 
         Raises:
-            ValueError: if a transform changes observations that contain angles, there is no ``observation``, or the
-                workers of ``env`` differ.
+            ValueError: if a transform changes observations that contain angles, there is no ``observation`` or no
+                design, or the workers of ``env`` differ.
         """
         seen = observed(env)
         body, rewritten = body_of(env)

@@ -181,8 +181,8 @@ def make_policy(env: EnvBase, *, num_cells: Sequence[int] = (200, 200, 200), num
         policy on every device.
 
     Raises:
-        ValueError: if the actions of ``env`` are not bounded by -1 and 1, it has no ``observation``, or its workers
-            differ.
+        ValueError: if the actions of ``env`` are not bounded by -1 and 1, it has no ``observation`` or no designs, or
+            its workers differ.
 
     Example:
         >>> policy = Policy(PolicyNetwork(17, 6, 6))

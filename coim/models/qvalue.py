@@ -100,7 +100,7 @@ def make_qvalue(
         Critics on the device and in the dtype of the observations; their weights are drawn on the CPU.
 
     Raises:
-        ValueError: if the workers of ``env`` differ.
+        ValueError: if ``env`` has no designs, or its workers differ.
 
     Example:
         >>> import torch

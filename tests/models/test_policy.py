@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, MultiOneHot, Unbounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from coim.models import make_policy, select_run
+from coim.models import GaussianEnsemble, make_policy, make_qvalue, select_run
 
 
 def test_it_writes_what_an_actor_writes(toy_env, make_rows):
@@ -77,6 +77,16 @@ def test_a_foreign_environment_needs_three_specs_only():
     policy = make_policy(Foreign(), num_cells=(8,))
     td = TensorDict({"observation": torch.zeros(1, 7), "design": torch.zeros(1, 1)}, [1])
     assert policy(td)["action"].shape == (1, 2)
+
+
+@pytest.mark.parametrize("make", [make_policy, make_qvalue, GaussianEnsemble.for_env])
+def test_an_environment_without_designs_is_told_what_it_must_be(make):
+    class Fixed:
+        observation_spec = Composite(observation=Unbounded((7,)))
+        action_spec = Bounded(-1, 1, shape=(2,))
+
+    with pytest.raises(ValueError, match=r"Fixed has no designs, .*; take a MorphEnv such as HopperMorph, its dream"):
+        make(Fixed())
 
 
 @pytest.mark.parametrize("spec", [Bounded(-2, 2, shape=(2,)), Unbounded((2,)), MultiOneHot([3, 3])])
