@@ -19,7 +19,7 @@ from typing import Any, TextIO
 
 import ray
 
-from coim.experiments.run.interrupt import ANY_NAME
+from coim.experiments.run.interrupt import ANY_NAME, sentence_of
 
 ANSWER = 5.0  # s to wait for a cluster
 OBJECT_STORE = 80 * 2**20  # bytes; what a cell makes is on disk, nothing goes through Ray
@@ -69,7 +69,7 @@ def ray_running(terminal: TextIO, *, address: str | None = None, workers: int = 
                 )
             except Exception as error:  # Ray raises it bare where the machine is too busy to answer in time
                 raise OSError(
-                    f"Ray did not start on this machine ({str(error).splitlines()[0]}); give the same command again "
+                    f"Ray did not start on this machine ({sentence_of(error).splitlines()[0]}); give the same command again "
                     "when it is less busy"
                 ) from error
             yield
