@@ -68,9 +68,9 @@ def ray_running(terminal: TextIO, *, address: str | None = None, workers: int = 
                     **common,
                 )
             except Exception as error:  # Ray raises it bare where the machine is too busy to answer in time
+                why = sentence_of(error).splitlines()[0]
                 raise OSError(
-                    f"Ray did not start on this machine ({sentence_of(error).splitlines()[0]}); give the same command again "
-                    "when it is less busy"
+                    f"Ray did not start on this machine ({why}); give the same command again when it is less busy"
                 ) from error
             yield
     finally:
