@@ -61,12 +61,12 @@ def _products(row: str, listed: Sequence[Product], times_over: int, repeats: int
 
 
 def libraries(effort: Effort) -> list[Figure]:
-    """A compiled update by each library, one thread: what `FASTEST` chose should be the fastest."""
+    """An update by each library, one thread, not native: what `FASTEST` chose should be the fastest."""
     buffer = replay(1)
     found = []
     for precision in PRECISIONS:
         choices = dict(possible(precision))
-        ours = our_updates(buffer, effort, effort.updates, precision=precision)
+        ours = our_updates(buffer, effort, effort.updates, precision=precision, compile=False)
         floor = alone(update_products(effort), times=effort.updates)
         actions = {library: partial(under, choice, ours) for library, choice in choices.items()}
         times = interleaved({FLOOR: floor, **actions}, effort.repeats)

@@ -6,11 +6,10 @@ from a clock, so that the same seed on the same machine gives the same bits on e
 Anything that is not a float32 or bfloat16 matrix on a CPU goes PyTorch's own way.
 
 bfloat16 on a processor that has no products for it is emulated: a float32 product of the rounded inputs, whose result
-is rounded once (a compiler may leave a rounding out between two products). PyTorch's own takes ten times as long there,
+is rounded once. PyTorch's own takes ten times as long there,
 and oneDNN refuses it.
 
-Nothing here is differentiable: the callers write their gradients out, or need none. A compiler sees oneDNN's call as
-one operator of this library's, `coim::linear`: Inductor takes PyTorch's own only with weights that never change.
+Nothing here is differentiable: the callers write their gradients out, or need none.
 
 Shapes: R rows, F input features, O output features, G stacked layers.
 """
@@ -38,8 +37,8 @@ class Choice(NamedTuple):
 
 
 # Measured on one thread at the shapes of the recipes (batch 256, layers of 200); `make bench` says where it is wrong.
-# "update" is a compiled update of policy and critics, as a multiple of torch.mm's time for the float32 products:
-# `python -m benchmarks --only libraries`.
+# "update" is an update of policy and critics with these products, compiled by Inductor, in multiples of torch.mm's time
+# for the float32 products. `python -m benchmarks --only libraries` measures it without a compiler.
 FASTEST: dict[Kind, Choice] = {
     # Xeon with AMX. float32: update 1.51, by oneDNN 1.91. bfloat16: 0.99, by oneDNN 1.08.
     "AVX-512 of Intel": Choice("torch", "torch"),
@@ -53,20 +52,6 @@ FASTEST: dict[Kind, Choice] = {
 
 # The operator that PyTorch's own compiler emits for a fused linear layer; absent from builds without oneDNN.
 _LINEAR: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None) if torch.backends.mkldnn.is_available() else None
-
-_LIBRARY = torch.library.Library("coim", "FRAGMENT")
-_LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, str activation) -> Tensor")
-
-
-@torch.library.impl(_LIBRARY, "linear", "CPU")
-def _linear(x: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Tensor:
-    """``activation(x @ weight.T + bias)`` by oneDNN, as PyTorch's operator takes it: weight ``[O, F]``."""
-    return _LINEAR(x, weight, bias, activation, [], "")
-
-
-@torch.library.register_fake("coim::linear", lib=_LIBRARY)
-def _linear_shape(x: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> Tensor:
-    return x.new_empty(x.shape[0], weight.shape[0])
 
 
 def use(products: Named | Choice) -> Choice:
@@ -145,12 +130,7 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: Activation = "no
         return affine(x.float(), weight.float(), bias.float(), activation).to(x.dtype)
     if _by_onednn(x, weight):
         return _onednn(x, weight.t(), bias, activation)
-    if x.dim() == 2 and x.device.type == "cpu" and torch.compiler.is_compiling():
-        # A compiler adds the bias with the activation, in one pass. It would put a sum of two matrices back into addmm,
-        # which copies the bias into every row first; one with another dimension it leaves.
-        y = (torch.mm(x, weight).unsqueeze(0) + bias).squeeze(0)
-    else:
-        y = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(-2), x, weight)
+    y = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(-2), x, weight)
     if activation == "none":
         return y
     return y.relu_() if activation == "relu" else torch.nn.functional.silu(y, inplace=True)
@@ -187,9 +167,7 @@ def _by_onednn(x: Tensor, other: Tensor) -> bool:
 
 
 def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None = None, activation: Activation = "none") -> Tensor:
-    """As `_linear`, to a compiler as one operator, otherwise without the few microseconds that this costs."""
-    if torch.compiler.is_compiling():
-        return torch.ops.coim.linear(x, weight, bias, activation)
+    """``activation(x @ weight.T + bias)``, as PyTorch's operator takes it: weight ``[O, F]``."""
     return _LINEAR(x, weight, bias, activation, [], "")
 
 
@@ -212,4 +190,4 @@ def _maker() -> str:
         return platform.processor()
 
 
-_chosen = fastest()  # now, and not in the first product: a compiler may look on there
+_chosen = fastest()

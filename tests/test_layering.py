@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 
 # Import only from a lower rank, or from your own room. The rooms of rank 1 do not know each other; rank 2 is one room.
 RANKS = {name: 0 for name in ("objectives.functional", "products", "angles", "randomness", "calling", "lazy", "tables")}
-RANKS |= {"kept_code": 0}
+RANKS |= {"native": 0}
 RANKS |= {name: 1 for name in ("envs", "models", "objectives", "designs", "buffers", "batches", "compiling", "pairs")}
 RANKS |= {name: 2 for name in ("learners", "episode", "imagination", "events", "agreement", "design_choice")}
 RANKS |= {name: 2 for name in ("updates", "position", "coadaptation", "checkpoints", "saved_run", "run_folder")}

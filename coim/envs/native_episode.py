@@ -1,4 +1,4 @@
-"""Whole episodes as native code: ``native_episode.cpp``, made by the C++ compiler that `torch.compile` needs too.
+"""Whole episodes as native code: ``native_episode.cpp``, made by a C++ compiler where they are first needed.
 
 In Python a step of one body takes 2.5 to 4.6 times as long as its physics: some thirty calls of torch, numpy and
 MuJoCo, each of a few microseconds. Here the bodies, which do not depend on each other, go through their episode one by
@@ -11,11 +11,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,12 +24,16 @@ from torch import Tensor
 from coim.envs.fleet import not_finite
 from coim.envs.morph import MorphEnv
 from coim.envs.simulation import BEYOND_PHYSICS, mujoco_library
-from coim.kept_code import folder
+from coim.native import Source
 
-SOURCE = Path(__file__).with_suffix(".cpp")
-# Sums in the order that they are written in, and products that are fused only where the source says so.
-OPTIONS = ("-std=c++17", "-O3", "-ffp-contract=off", "-shared", "-fPIC")
-FOR_THIS_PROCESSOR: tuple[list[str], ...] = (["-march=native"], ["-mcpu=native"], [])  # the first that a compiler knows
+SOURCE = Source(
+    path=Path(__file__).with_suffix(".cpp"),
+    # Sums in the order that they are written in, and products that are fused only where the source says so.
+    options=("-O3", "-ffp-contract=off", f"-I{Path(mujoco.__file__).parent / 'include'}"),
+    made_from=mujoco.__version__,
+    purpose="native episodes",
+    way_out="leave native episodes out",
+)
 BROKEN, NOT_FINITE = 1, 2  # as in the source
 AT_ONCE = 5_000  # steps of all bodies in a call, about half a second: only between calls does Python hear Ctrl-C
 
@@ -217,62 +216,9 @@ def can_be_native() -> bool:
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The compiled source, of an earlier process or made now.
+    """The compiled source.
 
     Raises:
-        RuntimeError: if there is no compiler, it cannot compile the source, or what it makes cannot be kept or loaded;
-            the message has its words.
+        RuntimeError: if it cannot be compiled, see `coim.native.Source.library`.
     """
-    compiler = _compiler()
-    include = Path(mujoco.__file__).parent / "include"
-    # What the compiler predefines names its version and what the processor can do: a home folder may serve others.
-    options, predefined = _options(compiler)
-    parts = (SOURCE.read_text(), predefined, mujoco.__version__, repr(options))
-    path = folder() / f"episode-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.so"
-    if path.exists():
-        try:
-            return ctypes.CDLL(str(path))
-        except OSError:  # half a file
-            pass
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as beside:
-            made = Path(beside) / path.name
-            _run([compiler, *options, f"-I{include}", str(SOURCE), "-o", str(made)])
-            os.replace(made, path)
-        return ctypes.CDLL(str(path))
-    except OSError as error:
-        raise RuntimeError(f"native episodes cannot be kept in {path.parent}, leave them out: {error}") from error
-
-
-def _compiler() -> str:
-    """The C++ compiler that Inductor would take."""
-    asked = os.environ.get("CXX")
-    for name in [asked] if asked else ["g++", "clang++", "c++"]:
-        if (found := shutil.which(name)) is not None:
-            return found
-    raise RuntimeError(
-        f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or leave native episodes out"
-    )
-
-
-def _options(compiler: str) -> tuple[list[str], str]:
-    """Options of the compiler on this processor, and what it predefines with them."""
-    refused: RuntimeError | None = None
-    for more in FOR_THIS_PROCESSOR:
-        try:
-            return [*OPTIONS, *more], _run([compiler, *OPTIONS, *more, "-dM", "-E", "-x", "c++", os.devnull])
-        except RuntimeError as error:
-            refused = refused or error
-    raise refused or RuntimeError
-
-
-def _run(command: list[str]) -> str:
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    except OSError as error:  # a file that is no program
-        raise RuntimeError(f"native episodes cannot be compiled, leave them out; {command[0]}: {error}") from error
-    if done.returncode:
-        said = done.stderr[-2000:] or f"it ended with {done.returncode}"
-        raise RuntimeError(f"native episodes cannot be compiled, leave them out; {' '.join(command)}: {said}")
-    return done.stdout
+    return SOURCE.library()

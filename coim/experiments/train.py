@@ -34,7 +34,7 @@ from coim.experiments.run.machine import (
     available_cores,
     check_compiler,
     check_logger,
-    check_native_episodes,
+    check_native_code,
     checked_device,
     folder_of_compiled_code,
     prepare,
@@ -95,15 +95,16 @@ def train(
     products = begin_or_resume(name, settings)
     if needing := [name for name in ("compile", "native_episodes") if getattr(settings, name)]:
         check_compiler(without=" ".join(option(f"no_{name}") for name in needing))
-    if settings.native_episodes:
-        check_native_episodes()
+    on_cpu = settings.device == "cpu"
+    native = settings.compile and on_cpu and settings.precision == "float32"
+    check_native_code(gradients=native, episodes=settings.native_episodes)
     check_logger(settings.log)
     with folder_of(name, settings) as folder:
         algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
-        how = "compiled in the first episode" if settings.compile else "not compiled"
-        on_cpu = settings.device == "cpu"
+        compiled = "native gradients" if native else "compiled in the first episode"
+        how = compiled if native or (settings.compile and not on_cpu) else "not compiled"
         by = f", products by {words_of(products)}" if on_cpu else ""
         print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how}{by} -> {folder}")
         if on_cpu and settings.precision == "bfloat16" and products.bfloat16 == "emulated":

@@ -8,6 +8,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim import optimizer
+
+from coim.objectives.native_gradients import AdamStep
 
 # One graph repeats so many updates: launched one by one, small networks wait for Python between them.
 PER_GRAPH = 50
@@ -25,10 +28,7 @@ class FlatAdam(torch.optim.Adam):
         """Do one step."""
         (group,) = self.param_groups
         (weights,) = group["params"]
-        state = self.state[weights]
-        if not state:
-            state["step"] = torch.zeros((), device=weights.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weights), torch.zeros_like(weights)
+        state = self.moments()
         if group["amsgrad"] and "max_exp_avg_sq" not in state:
             state["max_exp_avg_sq"] = torch.zeros_like(weights)
         state["step"] += 1
@@ -44,6 +44,49 @@ class FlatAdam(torch.optim.Adam):
             beta1=beta1,
             beta2=beta2,
             **{name: group[name] for name in ("lr", "weight_decay", "eps", "amsgrad", "maximize")},
+        )
+
+    def is_plain(self) -> bool:
+        """Whether a step does what Adam's equations say and nothing else: nobody looks on, by a hook or a scheduler."""
+        (group,) = self.param_groups
+        hooks = self._optimizer_step_pre_hooks, self._optimizer_step_post_hooks
+        everywhere = optimizer._global_optimizer_pre_hooks, optimizer._global_optimizer_post_hooks
+        return not (any(hooks) or any(everywhere) or "step" in vars(self) or group["amsgrad"] or group["maximize"])
+
+    def moments(self) -> dict[str, Tensor]:
+        """The state of the weights, made where there is none yet."""
+        (weights,) = self.param_groups[0]["params"]
+        state = self.state[weights]
+        if not state:
+            state["step"] = torch.zeros((), device=weights.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weights), torch.zeros_like(weights)
+        return state
+
+    def as_native(self, targets: Tensor, tau: float) -> AdamStep:
+        """The next step as native code takes it; it does not count it.
+
+        Args:
+            targets: flat, they follow the last weights.
+            tau: share of the weights that moves into them.
+        """
+        (group,) = self.param_groups
+        (weights,), moments = group["params"], self.moments()
+        return AdamStep(
+            weights=weights.data_ptr(),
+            gradient=weights.grad.data_ptr(),
+            first=moments["exp_avg"].data_ptr(),
+            second=moments["exp_avg_sq"].data_ptr(),
+            targets=targets.data_ptr(),
+            count=len(weights),
+            followed=len(targets),
+            lr=float(group["lr"]),
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            eps=group["eps"],
+            decay=group["weight_decay"],
+            tau=tau,
+            decoupled=group["decoupled_weight_decay"],
+            steps=float(moments["step"]),
         )
 
 

@@ -12,6 +12,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from coim.models.ensemble import LOG_VAR_RANGE, GaussianEnsemble
 from coim.objectives.dynamics import EnsembleNLLLoss, check_one_step
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Network
+from coim.objectives.native_gradients import NativeDynamics
 from coim.objectives.runs import by_update, check_batch, check_runs_last
 
 STILL = 1e-6  # of an observation, if that is above 1: less than float32 tells apart, as in RunningNormaliser.std
@@ -40,7 +42,8 @@ class DynamicsLearner(FlatLearner):
         num_runs: K when the ensemble is stacked along the run axis.
         precision: ``"bfloat16"`` computes the network's products in bfloat16; weights, moments, targets and losses
             stay as they are.
-        compile: compile the gradients by `torch.compile` in the first update; results differ by rounding.
+        compile: compute the gradients by compiled code, made in the first update; results differ by rounding. On a CPU
+            that is native code, for float32 and layers up to 256 units; all else there is as without.
 
     Attributes:
         loss: the `EnsembleNLLLoss` over the same parameters, for those who want its value or its gradients.
@@ -178,7 +181,8 @@ class DynamicsLearner(FlatLearner):
             for flat in (self._read_weights, self._gradient)
         )
         # A CPU multiplies the matrices of one member after the other; a GPU takes all members in one product.
-        self._stacked = self._weights.device.type != "cpu" or self._read_weights.dtype == torch.float64
+        in_one = self._read_weights.dtype == torch.float64 and not self._native
+        self._stacked = self._weights.device.type != "cpu" or in_one
         members = [slice(None)] if self._stacked else range(len(read[0]))
         self._networks = [Network([w[m] for w in read[0::2]], [b[m] for b in read[1::2]]) for m in members]
         self._gradients = [[part[m] for part in gradients] for m in members]
@@ -198,9 +202,13 @@ class DynamicsLearner(FlatLearner):
             batches = [(x.repeat_interleave(members, 0), target.repeat_interleave(members, 0))]
         else:
             batches = [pair for pair in zip(x, target) for _ in range(members)]
-        losses = []
-        for network, own, batch in zip(self._networks, self._gradients, batches):
-            gradients, loss = self._find(network, *batch, log_var_range=LOG_VAR_RANGE)
-            torch._foreach_copy_(own, gradients)
-            losses.append(loss)
+        threads, losses = torch.get_num_threads(), []
+        for member, (network, own, batch) in enumerate(zip(self._networks, self._gradients, batches)):
+            if self._native:
+                make = partial(NativeDynamics, network, own, *batch, log_var_range=LOG_VAR_RANGE, threads=threads)
+                losses.append(self._prepared(member, make)(*batch))
+            else:
+                gradients, loss = self._find(network, *batch, log_var_range=LOG_VAR_RANGE)
+                torch._foreach_copy_(own, gradients)
+                losses.append(loss)
         return torch.stack(losses).reshape(-1, members).sum(-1)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from coim.compiling import Compiled
 from coim.learners.captured import FlatUpdates
+from coim.objectives.native_gradients import pays
 
 Precision = Literal["float32", "bfloat16"]
 WAY_OUT = (
@@ -36,7 +37,8 @@ class FlatLearner:
         weight_decay: L2 penalty of Adam.
         num_runs: K when the networks are stacked along the run axis.
         precision: ``"bfloat16"`` has the products read a copy of the weights in bfloat16; the weights stay as they are.
-        compile: compile the gradients in the first update.
+        compile: compute the gradients by compiled code, made in the first update: native code on a CPU, where it is
+            known to be faster, see `coim.objectives.native_gradients.pays`; elsewhere that of `torch.compile`.
 
     Attributes:
         num_runs: K, or None.
@@ -80,9 +82,11 @@ class FlatLearner:
         self._read_weights = in_precision(self._weights.detach(), precision)
         self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
         self.optimiser = self._updates.optimiser
-        self._compiled = Compiled(gradients, self._weights.device) if compile else None
+        on_cpu = self._weights.device.type == "cpu"
+        self._native = compile and on_cpu and precision == "float32" and pays(self._parameters())
+        self._compiled = Compiled(gradients) if compile and not on_cpu else None
         self._plain: Callable[..., Any] = gradients
-        self._code: Callable[..., Any] | None = None  # while updates are done
+        self._code: dict[int, Any] = {}  # while updates are done
 
     def state_dict(self) -> dict[str, Any]:
         """Return what learning has changed, and the shapes of the weights by name. Tensors are not copied."""
@@ -131,13 +135,19 @@ class FlatLearner:
         try:
             return self._updates.mean(batches)
         finally:
-            self._code = None
+            self._code.clear()
 
     def _find(self, *inputs: Any, **settings: Any) -> Any:
-        """Call the gradients. Compiled ones look at the first inputs of a `_mean`: all others have the same shapes."""
-        if self._code is None:
-            self._code = self._compiled.checked(*inputs, **settings) if self._compiled else self._plain
-        return self._code(*inputs, **settings)
+        """Call the gradients, compiled by `torch.compile` or not."""
+        compiled = self._compiled
+        code = self._plain if compiled is None else self._prepared(0, lambda: compiled.checked(*inputs, **settings))
+        return code(*inputs, **settings)
+
+    def _prepared(self, which: int, make: Callable[[], Any]) -> Any:
+        """Code that looked at the first inputs of a `_mean`: all others have the same shapes."""
+        if which not in self._code:
+            self._code[which] = make()
+        return self._code[which]
 
     def _renew(self) -> None:
         """Copy the weights to where products read them."""

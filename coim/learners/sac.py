@@ -12,7 +12,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import Any, Literal
 
@@ -21,15 +22,19 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
+from coim.learners.captured import FlatAdam
 from coim.learners.flat_weights import FlatLearner, Precision, in_precision, share_storage, views
 from coim.learners.known_networks import check_exchangeable, check_sac_networks
 from coim.learners.rows import check_sac_rows, on_device, sac_batch
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
 from coim.objectives.gradients import Batch, Network, sac_gradients
+from coim.objectives.native_gradients import NativeSAC, native_updates
 from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
+
+AT_ONCE = 50  # native updates in a call: only between calls does Python hear Ctrl-C
 
 
 class SACLearner(FlatLearner):
@@ -46,7 +51,8 @@ class SACLearner(FlatLearner):
         num_runs: K when the networks are stacked along the run axis.
         precision: ``"bfloat16"`` computes the networks' products in bfloat16; weights, moments, targets and losses
             stay as they are.
-        compile: compile the gradients by `torch.compile` in the first update; results differ by rounding.
+        compile: compute the gradients by compiled code, made in the first update; results differ by rounding. On a CPU
+            that is native code, for float32 and layers up to 256 units; all else there is as without.
         seed: seeds the learner's own generator, which draws all noise of the policy.
 
     Attributes:
@@ -62,8 +68,8 @@ class SACLearner(FlatLearner):
 
     Note:
         On CUDA fifty updates at once are captured as a CUDA graph and replayed, after the first fifty, which are
-        launched one by one; a graph is kept for each size of batches. Where the gradients are compiled, all batches
-        must have one size.
+        launched one by one; a graph is kept for each size of batches. Where the gradients are compiled there, all
+        batches must have one size.
 
         Moving the modules to another device or dtype afterwards, or giving them to another learner, parts them from the
         flat buffers; `update` refuses that.
@@ -107,12 +113,11 @@ class SACLearner(FlatLearner):
         self._targets = share_storage([self.loss.target_qvalue_params.get(key) for key in keys])
         self._read_targets = in_precision(self._targets, precision)
         one_by_one = num_runs is None or self._weights.device.type == "cpu"
-        self._flat = compile and one_by_one and num_runs in (None, 1)
         self._cut_networks(one_by_one=one_by_one)
         self.tau = tau
-        # A number would become a constant of what is compiled or captured. That reads these, renewed before updates;
-        # torch.compile takes a float64 scalar without a dimension for such a number, and fails.
-        read = ("alpha", "gamma", "tau") if self._updates.captures else ("alpha", "gamma") if compile else ()
+        # A number would become a constant of what is captured. That reads these, renewed before updates; torch.compile
+        # takes a float64 scalar without a dimension for such a number, and fails.
+        read = ("alpha", "gamma", "tau") if self._updates.captures else ()
         self._read_numbers = {name: self._weights.detach().new_empty(1) for name in read}
         self.rng = torch.Generator(self._weights.device).manual_seed(seed)
 
@@ -170,18 +175,41 @@ class SACLearner(FlatLearner):
         means = self._mean(rows)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
 
+    def _mean(self, batches: Iterable[Tensor]) -> Tensor:
+        """As `FlatLearner._mean`, in one call for many updates where native code does all that an update does."""
+        optimiser = self.optimiser
+        if not (self._native and isinstance(optimiser, FlatAdam) and optimiser.is_plain()):
+            return super()._mean(batches)
+        self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
+        rows, found = Batch(*batches), []
+        threads = torch.get_num_threads()
+        runs = [
+            NativeSAC(
+                *networks, own, Batch(*(x[0, run] for x in rows)), log_scale_range=LOG_SCALE_RANGE, threads=threads
+            )
+            for run, (networks, own) in enumerate(zip(self._networks, self._gradients))
+        ]
+        for part in zip(*(x.split(AT_ONCE) for x in rows)):
+            step = optimiser.as_native(self._targets, self.tau)
+            found.append(native_updates(runs, Batch(*part), step, alpha=float(self.loss.alpha), gamma=self.loss.gamma))
+            optimiser.moments()["step"] += len(part[0])
+        return torch.cat(found).mean(0).mT
+
     def _update_once(self, *rows: Tensor) -> Tensor:
         """Do one update with the rows of a `Batch`, ``[K, B, ...]``; return losses and entropy, ``[3, K]``."""
         self._renew()
         numbers = self._numbers() | self._read_numbers
-        settings = {"alpha": numbers["alpha"], "gamma": numbers["gamma"], "log_scale_range": LOG_SCALE_RANGE}
-        settings["flat"] = self._flat
-        losses = []
+        settings = {"alpha": numbers["alpha"], "gamma": numbers["gamma"]}
+        threads, losses = torch.get_num_threads(), []
         for run, (networks, own) in enumerate(zip(self._networks, self._gradients)):
             batch = Batch(*(x[run] for x in rows)) if self._one_by_one else Batch(*rows)
-            gradients, found = self._find(*networks, batch, **settings)
-            torch._foreach_copy_(own, gradients)
-            losses.append(found)
+            if self._native:
+                make = partial(NativeSAC, *networks, own, batch, log_scale_range=LOG_SCALE_RANGE, threads=threads)
+                losses.append(self._prepared(run, make)(batch, **settings))
+            else:
+                gradients, found = self._find(*networks, batch, log_scale_range=LOG_SCALE_RANGE, **settings)
+                torch._foreach_copy_(own, gradients)
+                losses.append(found)
         self.optimiser.step()
         self._targets.lerp_(self._weights[-len(self._targets) :], numbers["tau"])
         return torch.stack(losses, -1).reshape(3, -1)
@@ -223,40 +251,18 @@ class SACLearner(FlatLearner):
             [g[run] for g in gradients["policy"]] + [g[(*run, n)] for n in copies for g in gradients["qvalue"]]
             for run in runs
         ]
-        if self._flat:
-            self._gradients = [[self._gradient]]
 
     def _noise(self, action: Tensor) -> Tensor:
         return torch.randn(action.shape, generator=self.rng, dtype=action.dtype, device=action.device)
 
 
 def sac_gradients_in_order(
-    policy: Network,
-    critics: Sequence[Network],
-    targets: Sequence[Network],
-    batch: Batch,
-    *,
-    flat: bool,
-    **settings: Any,
+    policy: Network, critics: Sequence[Network], targets: Sequence[Network], batch: Batch, **settings: Any
 ) -> tuple[list[Tensor], Tensor]:
-    """`sac_gradients` as a list; and actor loss, critic loss and entropy, ``[3, (K)]``.
-
-    Args:
-        policy: see `sac_gradients`, as of the next three.
-        critics: likewise.
-        targets: likewise.
-        batch: likewise.
-        flat: for a single run, return one tensor ``[N]`` in the order of its weights. Compiled code then computes each
-            gradient at its place, and hands over one tensor where it had two dozen.
-        settings: of `sac_gradients`.
-    """
+    """`sac_gradients` as a list, policy first; and actor loss, critic loss and entropy, ``[3, (K)]``."""
     found = sac_gradients(policy, critics, targets, batch, **settings)
     losses = torch.stack([found.loss_actor, found.loss_qvalue, found.entropy])
-    if not flat:
-        return [*found.policy, *chain(*found.critics)], losses
-    # Critics are stacked: a layer's weights of all critics lie before the layer's biases of all critics.
-    parts = [*found.policy, *chain(*zip(*found.critics))]
-    return [torch.cat([part.reshape(-1) for part in parts])], losses
+    return [*found.policy, *chain(*found.critics)], losses
 
 
 def _network(layers: Sequence[Tensor], index: Any) -> Network:

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,11 +18,6 @@ ROWS = {f"{row}, K = {runs}" for row in ("update", "small update", "iteration") 
 
 def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "marked_tests", lambda seconds: {"holds": True, "tests": 0})
-    # To compile takes ten seconds.
-    monkeypatch.setattr(
-        "coim.learners.flat_weights.Compiled",
-        lambda find, device: SimpleNamespace(checked=lambda *inputs, **settings: find),
-    )
     main(Options(rehearse=True, out=tmp_path / "runs" / "gpu.json"))
     found = json.loads((tmp_path / "runs" / "gpu.json").read_text())
     assert found["rehearsal"]
@@ -34,10 +28,10 @@ def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatc
 
 
 def test_what_cannot_be_compiled_is_told_beside_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_compiler(find: object, device: object) -> None:
+    def no_compiler(*_: object, **__: object) -> None:
         raise RuntimeError("no compiler")
 
-    monkeypatch.setattr("coim.learners.flat_weights.Compiled", no_compiler)
+    monkeypatch.setattr("coim.learners.sac.NativeSAC", no_compiler)
     found = gpu.update(gpu.TINY, 2, torch.device("cpu"))
     assert found["failed"] == {"float32, compiled": "RuntimeError: no compiler"}
     assert not found["holds"]

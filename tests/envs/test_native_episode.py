@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -32,6 +31,7 @@ from coim.buffers import ROW_KEYS
 from coim.envs import native_episode
 from coim.envs.native_episode import can_be_native, library
 from coim.models import PolicyNetwork
+from coim.native import OPTIONS, Source, find_compiler
 
 STEPS = 60
 
@@ -303,8 +303,8 @@ def test_code_is_made_once_for_all_processes_and_anew_if_it_is_damaged(
 ) -> None:
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     runs: list[list[str]] = []
-    really = native_episode._run
-    monkeypatch.setattr(native_episode, "_run", lambda command: (runs.append(command), really(command))[1])
+    really = Source.run
+    monkeypatch.setattr(Source, "run", lambda source, command: (runs.append(command), really(source, command))[1])
     compiled = lambda: [command for command in runs if "-o" in command]  # noqa: E731
     library.__wrapped__()
     (made,) = tmp_path.rglob("*.so")
@@ -337,7 +337,7 @@ def test_without_a_compiler_or_with_one_that_fails_a_sentence_says_so(
         monkeypatch.setenv("CXX", str(tmp_path / "broken"))
         assert not can_be_native()
         monkeypatch.setenv("CXX", "false")
-        with pytest.raises(RuntimeError, match=r"native episodes cannot be compiled, leave them out; \S*false -std"):
+        with pytest.raises(RuntimeError, match=r"cannot be compiled, leave native episodes out; \S*false -std"):
             library()
     finally:
         library.cache_clear()
@@ -349,18 +349,18 @@ def test_a_compiler_that_does_not_know_the_processor_compiles_for_any(
     compiler = tmp_path / "c++"
     compiler.write_text(
         '#!/bin/sh\nfor word; do case $word in -m*=native) echo "unknown $word" >&2; exit 1;; esac; done\n'
-        f'exec {native_episode._compiler()} "$@"\n'
+        f'exec {find_compiler("")} "$@"\n'
     )
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     assert hasattr(library.__wrapped__(), "act")
-    assert native_episode._options(str(compiler))[0] == [*native_episode.OPTIONS]
+    assert native_episode.SOURCE.command(str(compiler))[0] == [str(compiler), *OPTIONS, *native_episode.SOURCE.options]
 
 
 def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
     """Names and sizes of all fields, in their order, as the compiler sees them."""
-    source = native_episode.SOURCE.read_text()
+    source = native_episode.SOURCE.path.read_text()
     checks = []
     for name, structure in (("Layer", native_episode._Layer), ("Episode", native_episode._Episode)):
         checks.append(f"static_assert(sizeof({name}) == {native_episode.ctypes.sizeof(structure)});")
@@ -370,12 +370,7 @@ def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
     assert len(checks) == 2 + 6 + 27
     file = tmp_path / "check.cpp"
     file.write_text("#include <cstddef>\n" + source + "\n".join(checks))
-    include = Path(native_episode.mujoco.__file__).parent / "include"
-    compiler = native_episode._compiler()
-    options = native_episode._options(compiler)[0]
-    done = subprocess.run(
-        [compiler, *options, f"-I{include}", str(file), "-o", os.devnull], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    command, _ = native_episode.SOURCE.command(find_compiler(""))
+    native_episode.SOURCE.run([*command, str(file), "-o", os.devnull])
     assert re.search(r"enum Ending \{ WHOLE = 0, BROKEN = 1, NOT_FINITE = 2 \};", source)
     assert (native_episode.BROKEN, native_episode.NOT_FINITE) == (1, 2)

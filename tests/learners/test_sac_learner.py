@@ -47,15 +47,14 @@ def test_updates_equal_the_loss_adam_and_soft_update(make_rows: Rows, mix: str, 
         torch.testing.assert_close(learner.loss.state_dict()[key], value, rtol=0, atol=1e-9)
 
 
-def test_compiled_updates_refuse_batches_of_another_size_also_after_others(make_rows: Rows) -> None:
-    learner = sac_learner(compile=True)
-    learner.update(make_rows(2, 32))
-    learner.update(make_rows(2, 32))
-    before = weights(learner)
-    with pytest.raises(RuntimeError, match="expected 32, actual 31"):
-        learner.update(make_rows(2, 31))
-    assert all(torch.equal(value, before[key]) for key, value in weights(learner).items())
-    learner.update(make_rows(2, 32))
+def test_native_updates_take_batches_of_any_size(make_rows: Rows) -> None:
+    native, plain = (sac_learner(compile=compile) for compile in (True, False))
+    for updates, size in ((2, 32), (1, 1), (3, 31), (2, 32)):
+        rows = make_rows(updates, size)
+        native.update(rows)
+        plain.update(rows)
+        for key, value in weights(plain).items():
+            torch.testing.assert_close(weights(native)[key], value, rtol=0, atol=1e-9)
 
 
 def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(make_rows: Rows) -> None:
@@ -330,3 +329,44 @@ def test_a_gpu_ends_where_a_cpu_ends(make_rows: Rows, num_runs: int | None) -> N
             learner.start_from(learner)
     for key, value in on_cpu.loss.state_dict().items():
         torch.testing.assert_close(on_gpu.loss.state_dict()[key].cpu(), value, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("settings", [{}, {"weight_decay": 0.1}, {"weight_decay": 0.5, "decoupled_weight_decay": True}])
+def test_native_updates_follow_the_settings_of_adam_and_count_its_steps(make_rows: Rows, settings: dict) -> None:
+    native, plain = (sac_learner(compile=compile) for compile in (True, False))
+    for learner in (native, plain):
+        learner.optimiser.param_groups[0].update(settings, lr=1e-2, betas=(0.8, 0.95), eps=1e-4)
+        learner.update(make_rows(60, 16))
+        learner.optimiser.zero_grad()
+        learner.update(make_rows(3, 16, seed=1))
+    for key, value in weights(plain).items():
+        torch.testing.assert_close(weights(native)[key], value, rtol=0, atol=1e-9)
+    moments, expected = native.state_dict()["moments"], plain.state_dict()["moments"]
+    assert moments.keys() == expected.keys()
+    assert moments["step"] == 63
+    for name, moment in expected.items():
+        torch.testing.assert_close(moments[name], moment, rtol=0, atol=1e-9)
+
+
+def test_who_looks_on_at_a_step_of_adam_sees_every_one_of_native_updates(make_rows: Rows) -> None:
+    seen = []
+    learner, alone = (sac_learner(compile=True) for _ in range(2))
+    learner.optimiser.register_step_post_hook(lambda optimiser, *_: seen.append(float(optimiser.moments()["step"])))
+    learner.update(make_rows(5, 16))
+    alone.update(make_rows(5, 16))
+    assert seen == [1, 2, 3, 4, 5]
+    for key, value in weights(alone).items():
+        torch.testing.assert_close(weights(learner)[key], value, rtol=0, atol=1e-9)
+    scheduler = torch.optim.lr_scheduler.ExponentialLR(alone.optimiser, 0.5)
+    alone.update(make_rows(5, 16))
+    scheduler.step()  # warns, which is an error here, if it has seen no step
+    assert alone.optimiser.param_groups[0]["lr"] == pytest.approx(1.5e-4)
+
+
+def test_other_kinds_of_adam_step_after_native_gradients(make_rows: Rows) -> None:
+    native, plain = (sac_learner(compile=compile) for compile in (True, False))
+    for learner in (native, plain):
+        learner.optimiser.param_groups[0]["amsgrad"] = True
+        learner.update(make_rows(5, 16))
+    for key, value in weights(plain).items():
+        torch.testing.assert_close(weights(native)[key], value, rtol=0, atol=1e-9)

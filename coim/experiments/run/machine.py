@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
-import shutil
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -13,8 +12,10 @@ from pathlib import Path
 
 import torch
 
-from coim.envs.native_episode import library
+from coim.envs import native_episode
 from coim.experiments.run.atomic_write import says_full
+from coim.native import find_compiler
+from coim.objectives import native_gradients
 from coim.products import Choice, Library, Named, use
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -44,11 +45,12 @@ def check_compiler(without: str = "--no-compile --no-native-episodes") -> None:
         without: options that do without, for the message.
 
     Raises:
-        ValueError: if there is no C++ compiler, or what it makes could not be loaded from where Inductor puts it.
+        ValueError: if there is no C++ compiler, or what it makes could not be loaded from where it is put.
     """
-    asked = os.environ.get("CXX")
-    if not any(shutil.which(name) for name in ([asked] if asked else ["g++", "clang++", "c++"])):
-        raise ValueError(f"no C++ compiler ({asked or 'g++, clang++ or c++'}) was found; install one, or {without}")
+    try:
+        find_compiler(without)
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
     folder = folder_of_compiled_code()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     noexec = hasattr(os, "ST_NOEXEC") and os.statvfs(there).f_flag & os.ST_NOEXEC
@@ -74,23 +76,32 @@ def check_logger(kind: str) -> None:
         raise ValueError(f"--log {kind} needs {package}, which is not installed: pip install {package}, or --log off")
 
 
-def check_native_episodes() -> None:
-    """Compile native episodes, or find what an earlier process has compiled.
+def check_native_code(*, gradients: bool, episodes: bool) -> None:
+    """Compile the native code that a run will need, or find what an earlier process has compiled.
+
+    Args:
+        gradients: whether it needs native gradients.
+        episodes: whether it needs native episodes.
 
     Raises:
-        ValueError: if they cannot be compiled; the message has the compiler's words.
+        ValueError: if it cannot be compiled; the message has the compiler's words.
         OSError: if the disk is full.
     """
-    try:
-        library()
-    except RuntimeError as error:
-        if says_full(error):
-            raise OSError(f"disk full: {error}; make room there, or --no-native-episodes") from error
-        raise ValueError(f"{error} (--no-native-episodes)") from error
+    for needed, library, without in (
+        (gradients, native_gradients.library, "--no-compile"),
+        (episodes, native_episode.library, "--no-native-episodes"),
+    ):
+        try:
+            if needed:
+                library()
+        except RuntimeError as error:
+            if says_full(error):
+                raise OSError(f"disk full: {error}; make room there, or {without}") from error
+            raise ValueError(f"{error} ({without})") from error
 
 
 def folder_of_compiled_code() -> Path:
-    """Where Inductor puts what it compiles, or the folder in which it makes one."""
+    """Where compiled code lies, or the folder in which torch makes one for it."""
     return Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or tempfile.gettempdir()).absolute()
 
 

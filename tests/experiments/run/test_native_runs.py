@@ -25,7 +25,7 @@ def nothing_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
 @pytest.mark.parametrize(
     ("script", "sentence"),
     [
-        ("exit 1", r"cannot be compiled, leave them out; .*: it ended with 1 \(--no-native-episodes\)$"),
+        ("exit 1", r"cannot be compiled, leave native episodes out; .*: it ended with 1 \(--no-native-episodes\)$"),
         ("echo no such header >&2; exit 1", r"no such header\s+\(--no-native-episodes\)$"),
         (f"echo '{os.strerror(errno.ENOSPC)}' >&2; exit 1", r"^disk full: [\s\S]* make room there, or --no-native-epi"),
     ],

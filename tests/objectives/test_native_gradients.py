@@ -1,0 +1,214 @@
+"""Native gradients: what the written-out ones compute, whatever the sizes and the number of threads."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from itertools import chain, pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from coim.native import Source, find_compiler, team
+from coim.objectives import native_gradients
+from coim.objectives.dynamics_gradients import dynamics_gradients
+from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
+from coim.objectives.native_gradients import AdamStep, NativeDynamics, NativeSAC, pays
+
+CLAMPED = (-0.5, 0.5)  # of the log-scale: some are inside, some outside
+# Sizes of batch, observation, design, action, hidden layers; number of critics.
+SIZES = [
+    (256, 17, 7, 6, (64, 64, 64), 2),
+    (150, 11, 4, 3, (200, 200), 2),
+    (33, 5, 1, 9, (16, 37), 3),
+    (7, 3, 2, 1, (5,), 1),
+    (1, 1, 1, 1, (), 2),
+]
+EXACT = {torch.float64: 1e-11, torch.float32: 2e-4}
+
+
+def network(rng: torch.Generator, *sizes: int, dtype: torch.dtype) -> Network:
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=rng, dtype=torch.float64).to(dtype)
+
+    layers = list(pairwise(sizes))
+    return Network([random(*layer) / layer[0] ** 0.5 for layer in layers], [random(o) / 10 for _, o in layers])
+
+
+def unwritten(*networks: Network) -> list[Tensor]:
+    """Room for gradients, in which a number that nobody writes is found."""
+    parts = (chain(*zip(one.weights, one.biases)) for one in networks)
+    return [torch.full_like(part, torch.nan) for part in chain(*parts)]
+
+
+class Case:
+    """Networks and rows of some sizes."""
+
+    def __init__(self, sizes: tuple, dtype: torch.dtype = torch.float64) -> None:
+        size, observed, designed, acted, cells, critics = sizes
+        rng = torch.Generator().manual_seed(0)
+        seen = observed + acted + designed
+        self.policy = network(rng, observed + designed, *cells, 2 * acted, dtype=dtype)
+        self.critics = [network(rng, seen, *cells, 1, dtype=dtype) for _ in range(critics)]
+        self.targets = [network(rng, seen, *cells, 1, dtype=dtype) for _ in range(critics)]
+        rows = [(observed,), (designed,), (acted,), (observed,), (), (acted,), (acted,), ()]
+        numbers = [torch.randn(size, *shape, generator=rng, dtype=torch.float64).to(dtype) for shape in rows]
+        terminated = torch.rand(size, generator=rng) < 0.3
+        self.batch = Batch(*numbers[:5], terminated, *numbers[5:])
+
+    def expected(self) -> SACGradients:
+        networks = self.policy, self.critics, self.targets
+        return sac_gradients(*networks, self.batch, alpha=0.2, gamma=0.9, log_scale_range=CLAMPED)
+
+    def found(self, *, threads: int = 1) -> tuple[list[Tensor], Tensor]:
+        gradients = unwritten(self.policy, *self.critics)
+        networks = self.policy, self.critics, self.targets
+        native = NativeSAC(*networks, gradients, self.batch, log_scale_range=CLAMPED, threads=threads)
+        return gradients, native(self.batch, alpha=0.2, gamma=0.9)
+
+
+@pytest.mark.parametrize("dtype", EXACT)
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+def test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes: tuple, dtype: torch.dtype) -> None:
+    case = Case(sizes, dtype)
+    expected = case.expected()
+    gradients, losses = case.found()
+    right = [*expected.policy, *chain(*expected.critics)]
+    for own, other in zip(gradients, right, strict=True):
+        torch.testing.assert_close(own, other, rtol=EXACT[dtype], atol=EXACT[dtype])
+    right = torch.stack([expected.loss_actor, expected.loss_qvalue, expected.entropy])
+    torch.testing.assert_close(losses, right, rtol=EXACT[dtype], atol=EXACT[dtype])
+
+
+@pytest.mark.parametrize("dtype", EXACT)
+@pytest.mark.parametrize("sizes", [(256, 30, 34, (64, 64)), (100, 9, 10, (129,)), (3, 2, 2, ())], ids=str)
+def test_gradients_and_loss_of_a_member_equal_the_written_out_ones(sizes: tuple, dtype: torch.dtype) -> None:
+    size, features, outputs, cells = sizes
+    rng = torch.Generator().manual_seed(0)
+    member = network(rng, features, *cells, outputs, dtype=dtype)
+    x, target = (torch.randn(size, n, generator=rng, dtype=dtype) for n in (features, outputs // 2))
+    expected = dynamics_gradients(member, x, target, log_var_range=(-10.0, 0.5))
+    gradients = unwritten(member)
+    loss = NativeDynamics(member, gradients, x, target, log_var_range=(-10.0, 0.5), threads=2)(x, target)
+    for own, other in zip(gradients, expected.parameters, strict=True):
+        torch.testing.assert_close(own, other, rtol=EXACT[dtype], atol=EXACT[dtype])
+    torch.testing.assert_close(loss[0], expected.loss, rtol=EXACT[dtype], atol=EXACT[dtype])
+
+
+def test_critics_that_say_the_same_share_the_gradient_of_the_policy() -> None:
+    case = Case(SIZES[2])
+    case.critics = [case.critics[0]] * 3
+    for own, other in zip(case.found()[0], case.expected().policy):
+        torch.testing.assert_close(own, other, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+def test_any_number_of_threads_computes_the_same_bits(threads: int) -> None:
+    case = Case(SIZES[0], torch.float32)
+    one, several = case.found(), case.found(threads=threads)
+    for own, other in zip([*one[0], one[1]], [*several[0], several[1]]):
+        assert torch.equal(own, other)
+
+
+def test_torch_lends_its_threads() -> None:
+    if not torch.backends.openmp.is_available():
+        pytest.skip("this torch has no OpenMP")
+    assert team() is not None
+
+
+@pytest.mark.parametrize("where", ["observation", "reward", "weight of a critic"])
+def test_a_number_that_is_not_finite_is_not_lost(where: str) -> None:
+    """A run that diverges is found by its losses, whichever function lies between."""
+    case = Case(SIZES[0], torch.float32)
+    broken = case.critics[1].weights[1] if where == "weight of a critic" else getattr(case.batch, where)
+    broken[0] = torch.nan
+    gradients, losses = case.found()
+    expected = case.expected()
+    right = torch.stack([expected.loss_actor, expected.loss_qvalue, expected.entropy])
+    assert losses.isnan().tolist() == right.isnan().tolist()
+    for own, other in zip(gradients, [*expected.policy, *chain(*expected.critics)]):
+        assert torch.equal(own.isnan(), other.isnan())
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        ("reward", lambda rows: rows[:, None], r"reward is \(7, 1\) of torch.float64, and \(7,\) of torch.float64"),
+        ("noise", lambda rows: rows.float(), r"noise is \(7, 1\) of torch.float32, and \(7, 1\) of torch.float64 is"),
+        ("terminated", lambda rows: rows.double(), r"terminated is \(7,\) of torch.float64, and \(7,\) of torch.bool"),
+        ("next_observation", lambda rows: rows.mT.contiguous().mT, "next_observation must be contiguous"),
+    ],
+)
+def test_rows_of_other_shapes_or_types_are_refused(name: str, change: object, sentence: str) -> None:
+    case = Case(SIZES[3])
+    case.batch = case.batch._replace(**{name: change(getattr(case.batch, name))})  # type: ignore[operator]
+    with pytest.raises(ValueError, match=sentence):
+        case.found()
+
+
+def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
+    case = Case(SIZES[3])
+    with pytest.raises(ValueError, match=r"2 gradients for 8 weights and biases"):
+        NativeSAC(case.policy, case.critics, case.targets, case.batch[:2], case.batch, log_scale_range=CLAMPED)
+    case.policy = case.policy._replace(weights=case.policy.weights[:1])
+    with pytest.raises(ValueError, match="the policy returns 5 numbers, and 2 are wanted"):
+        case.found()
+    case = Case(SIZES[3], torch.bfloat16)
+    with pytest.raises(TypeError, match=r"native gradients are of float32 or float64, not of torch.bfloat16; set"):
+        case.found()
+
+
+def test_wide_layers_are_left_to_the_libraries() -> None:
+    assert pays([torch.zeros(1000, 256), torch.zeros(256)])
+    assert not pays([torch.zeros(10, 257), torch.zeros(257)])
+
+
+def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compiler splits vectors that are wider than the processor's, so that the code for AVX-512 runs anywhere."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    text = native_gradients.SOURCE.path.read_text()
+    other = tmp_path / "other.cpp"
+    other.write_text(text.replace("#if defined(__AVX512F__)", "#if !defined(__AVX512F__)"))
+    assert other.read_text() != text
+    options = native_gradients.SOURCE.options
+    library = Source(path=other, options=options, purpose="code", way_out="fail").library()
+    monkeypatch.setattr(native_gradients, "library", lambda: library)
+    for sizes in SIZES:
+        test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes, torch.float32)
+
+
+def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
+    """Names and sizes of all fields, in their order, as the compiler sees them."""
+    checks = []
+    for structure in (native_gradients._Layer, native_gradients._Sac, native_gradients._Dynamics, AdamStep):
+        name = structure.__name__.removeprefix("_").removesuffix("Step")
+        checks.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(structure)});")
+        for field, _ in structure._fields_:
+            checks.append(f"static_assert(offsetof({name}, {field}) == {getattr(structure, field).offset});")
+    assert len(checks) == 4 + 6 + 27 + 11 + 15
+    file = tmp_path / "check.cpp"
+    file.write_text("#include <cstddef>\n" + native_gradients.SOURCE.path.read_text() + "\n".join(checks))
+    command, _ = native_gradients.SOURCE.command(find_compiler("install one"))
+    native_gradients.SOURCE.run([*command, "-fsyntax-only", str(file), "-o", os.devnull])
+
+
+def test_nothing_is_written_beside_the_gradients() -> None:
+    """There are numbers after each gradient that nobody may touch."""
+    case = Case(SIZES[2], torch.float32)
+    room = {}
+
+    def guarded(x: Tensor) -> Tensor:
+        wide = torch.full((x.numel() + 64,), torch.nan, dtype=x.dtype)
+        room[id(x)] = wide
+        own = wide[: x.numel()].view(x.shape)
+        return own.copy_(x)
+
+    gradients = [guarded(part) for part in unwritten(case.policy, *case.critics)]
+    guards = list(room.values())
+    networks = case.policy, case.critics, case.targets
+    NativeSAC(*networks, gradients, case.batch, log_scale_range=CLAMPED)(case.batch, alpha=0.2, gamma=0.9)
+    assert all(wide[-64:].isnan().all() and not wide[:-64].isnan().any() for wide in guards)
+    for own, right in zip(gradients, case.found()[0]):
+        assert torch.equal(own, right)
