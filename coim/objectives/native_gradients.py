@@ -32,8 +32,8 @@ SOURCE = Source(
 )
 NUMBERS = {torch.float32: "float", torch.float64: "double"}
 # Wider layers do not fit the cache, and the libraries' products pack them better. AMD EPYC with AVX2, one thread, in
-# multiples of torch.mm's time for the products, native and written out: SAC 3 x 64 1.04 and 2.8, 3 x 200 1.10 and 1.6;
-# a member of an ensemble 3 x 128 1.4 and 2.0, 3 x 256 1.35 and 1.46, 3 x 500 1.35 and 1.24.
+# multiples of torch.mm's time for the products, native and written out: SAC 3 x 64 0.93 and 2.8, 3 x 200 1.2 and 1.6; a
+# member of an ensemble 3 x 128 1.42 and 2.0, 3 x 256 1.39 and 1.5, 3 x 500 1.4 and 1.24.
 UP_TO = 256
 
 
