@@ -55,7 +55,7 @@ def measure(effort: Effort) -> list[Figure]:
 
 @contextmanager
 def empty_folder() -> Iterator[None]:
-    """Let Inductor, in processes to come, find nothing of what was compiled before."""
+    """Let processes to come find nothing of what was compiled before."""
     before = os.environ.get(FOLDER)
     with tempfile.TemporaryDirectory() as folder:
         os.environ[FOLDER] = folder

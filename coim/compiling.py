@@ -16,7 +16,7 @@ from torch.utils._pytree import tree_flatten
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Options of Inductor are process-wide while it compiles: one thread at a time.
+# The option that `_code_for` sets is process-wide: one thread at a time.
 _COMPILING = threading.Lock()
 _MADE: dict[Hashable, Any] = {}
 

@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -29,6 +30,7 @@ class Source:
     Args:
         path: the file.
         options: of the compiler, beside those for this processor.
+        wished: more of them, for compilers that know them.
         made_from: what else the code depends on, such as the version of what it includes.
         purpose: what the code is, in the plural, for errors.
         way_out: what who has no compiler can do, as a command.
@@ -36,6 +38,7 @@ class Source:
 
     path: Path
     options: tuple[str, ...]
+    wished: tuple[str, ...] = ()
     made_from: str = ""
     purpose: str
     way_out: str
@@ -69,8 +72,8 @@ class Source:
     def command(self, compiler: str) -> tuple[list[str], str]:
         """Call of the compiler for this processor, and what it predefines then."""
         refused: RuntimeError | None = None
-        for more in FOR_THIS_PROCESSOR:
-            command = [compiler, *OPTIONS, *self.options, *more]
+        for wished, more in product(dict.fromkeys([self.wished, ()]), FOR_THIS_PROCESSOR):
+            command = [compiler, *OPTIONS, *self.options, *wished, *more]
             try:
                 return command, self.run([*command, "-dM", "-E", "-x", "c++", os.devnull])
             except RuntimeError as error:

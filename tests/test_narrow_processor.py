@@ -18,7 +18,6 @@ ROOT = Path(__file__).parents[1]
 LIMITS = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
 FILES = (
     "tests/test_products.py",
-    "tests/test_compiling.py",
     "tests/models/test_stacked.py",
     "tests/objectives/test_gradients.py",
     "tests/objectives/test_dynamics_gradients.py",

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+
 from coim.coadaptation import CoAdaptation
 from coim.envs import MorphEnv
 from coim.events import DesignChosen, EpisodeDone
@@ -45,6 +47,7 @@ from coim.experiments.run.results import Results, folder_of
 from coim.experiments.run.resume import begin_or_resume
 from coim.experiments.run.run_log import FORMERLY, RunLog
 from coim.experiments.run.settings import QUICK, Settings, option
+from coim.objectives.native_gradients import UP_TO
 
 
 def main(body: type[MorphEnv], name: str, arguments: Sequence[str] | None = None) -> None:
@@ -95,8 +98,9 @@ def train(
     products = begin_or_resume(name, settings)
     if needing := [name for name in ("compile", "native_episodes") if getattr(settings, name)]:
         check_compiler(without=" ".join(option(f"no_{name}") for name in needing))
-    on_cpu = settings.device == "cpu"
-    native = settings.compile and on_cpu and settings.precision == "float32"
+    on_cpu = torch.device(settings.device).type == "cpu"
+    narrow = min(max(settings.num_cells, default=0), max(settings.model_cells, default=0)) <= UP_TO
+    native = settings.compile and on_cpu and settings.precision == "float32" and narrow
     check_native_code(gradients=native, episodes=settings.native_episodes)
     check_logger(settings.log)
     with folder_of(name, settings) as folder:

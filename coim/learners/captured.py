@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import optimizer
 
-from coim.objectives.native_gradients import AdamStep
+from coim.objectives.native_gradients import AdamStep, check_tensor
 
 # One graph repeats so many updates: launched one by one, small networks wait for Python between them.
 PER_GRAPH = 50
@@ -71,6 +71,8 @@ class FlatAdam(torch.optim.Adam):
         """
         (group,) = self.param_groups
         (weights,), moments = group["params"], self.moments()
+        for name in ("exp_avg", "exp_avg_sq"):
+            check_tensor(name, moments[name], tuple(weights.shape), weights.dtype)
         return AdamStep(
             weights=weights.data_ptr(),
             gradient=weights.grad.data_ptr(),

@@ -193,6 +193,8 @@ class DynamicsLearner(FlatLearner):
         raw = torch.cat([observation, batches["action"], batches["design"]], -1)
         inputs = self.ensemble.inputs(raw).to(self._read_weights.dtype)
         targets = self.ensemble.standardised_target(observation, batches["next", "observation"])
+        if self._native:
+            targets = targets.to(self._weights.dtype)
         return runs_first(inputs, self.num_runs), runs_first(targets, self.num_runs)
 
     def _write_gradients(self, x: Tensor, target: Tensor) -> Tensor:

@@ -189,7 +189,8 @@ class FlatLearner:
             else:
                 # Adam counts its steps on the CPU, unless it can be captured in a graph.
                 on_gpu = self.optimiser.defaults.get("capturable", False) or moment.ndim > 0
-                state[name] = moment.detach().to(self._weights.device if on_gpu else "cpu", copy=True)
+                dtype = self._weights.dtype if moment.ndim > 0 else moment.dtype
+                state[name] = moment.detach().to(self._weights.device if on_gpu else "cpu", dtype, copy=True)
 
 
 def share_storage(tensors: Sequence[Tensor]) -> Tensor:

@@ -34,7 +34,7 @@ from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
 
-AT_ONCE = 50  # native updates in a call: only between calls does Python hear Ctrl-C
+AT_ONCE = 50  # native updates of all runs in a call: only between calls does Python hear Ctrl-C
 
 
 class SACLearner(FlatLearner):
@@ -172,6 +172,8 @@ class SACLearner(FlatLearner):
         noise = self._noise(batches["action"]), self._noise(batches["action"])
         scaling = self.policy.network.scaling
         rows = sac_batch(batches, noise, scaling=scaling, mix=self.loss.mix, num_runs=self.num_runs)
+        if self._native:  # what is not native takes the dtype of the networks where it multiplies
+            rows = Batch(*(x if x.dtype == torch.bool else x.to(self._weights.dtype) for x in rows))
         means = self._mean(rows)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
 
@@ -189,10 +191,10 @@ class SACLearner(FlatLearner):
             )
             for run, (networks, own) in enumerate(zip(self._networks, self._gradients))
         ]
-        for part in zip(*(x.split(AT_ONCE) for x in rows)):
+        for part in zip(*(x.split(max(1, AT_ONCE // len(runs))) for x in rows)):
             step = optimiser.as_native(self._targets, self.tau)
+            optimiser.moments()["step"] += len(part[0])  # first: Ctrl-C is heard when the call is over
             found.append(native_updates(runs, Batch(*part), step, alpha=float(self.loss.alpha), gamma=self.loss.gamma))
-            optimiser.moments()["step"] += len(part[0])
         return torch.cat(found).mean(0).mT
 
     def _update_once(self, *rows: Tensor) -> Tensor:

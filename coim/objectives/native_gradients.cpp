@@ -805,7 +805,10 @@ void adam_step(const Adam& all, int64_t from, int64_t to, double steps) {
   T* __restrict targets = static_cast<T*>(all.targets);
   const T tau = all.tau;
   const int64_t before = all.count - all.followed;
-  for (int64_t i = std::max(from, before); i < to; ++i) targets[i - before] += tau * (weights[i] - targets[i - before]);
+  for (int64_t i = std::max(from, before); i < to; ++i) {  // from the nearer end, as torch.lerp: tau = 1 copies
+    const T target = targets[i - before], way = weights[i] - target;
+    targets[i - before] = tau < T(0.5) ? target + tau * way : weights[i] - (1 - tau) * way;
+  }
 }
 
 // Updates with rows [updates, runs, B, ...], of which the structures have the first ones.

@@ -26,9 +26,10 @@ from coim.objectives.gradients import Batch, Network
 SOURCE = Source(
     path=Path(__file__).with_suffix(".cpp"),
     # -O3 makes nothing faster here, and takes a third longer. Adam needs its loop in vectors, and bare square roots.
-    options=("-O2", "-ftree-loop-vectorize", "-fvect-cost-model=dynamic", "-fno-math-errno", "-ffp-contract=fast"),
+    options=("-O2", "-fno-math-errno", "-ffp-contract=fast"),
+    wished=("-ftree-loop-vectorize", "-fvect-cost-model=dynamic"),
     purpose="native gradients",
-    way_out="do not compile",
+    way_out="set compile=False",
 )
 NUMBERS = {torch.float32: "float", torch.float64: "double"}
 # Wider layers do not fit the cache, and the libraries' products pack them better. AMD EPYC with AVX2, one thread, in
@@ -89,6 +90,13 @@ class NativeSAC:
         _check_network("policy", policy, observed + designed, 2 * acted, weights)
         for critic in (*critics, *targets):
             _check_network("critic", critic, observed + acted + designed, 1, weights)
+        if len(targets) != len(critics):
+            raise ValueError(f"{len(targets)} targets for {len(critics)} critics; give one for each")
+        first = [tuple(weight.shape) for weight in critics[0].weights]
+        for other in (*critics, *targets):
+            if (found := [tuple(weight.shape) for weight in other.weights]) != first:
+                raise ValueError(f"a critic has layers {found}, the first one {first}; give them the same ones")
+        _check_size(size)
         _check_gradients([policy, *critics], gradients)
         self._shapes = {
             "observation": (size, observed),
@@ -145,14 +153,14 @@ class NativeSAC:
     def _check(self, batch: Batch, weights: Tensor) -> None:
         for name, rows in zip(self._shapes, batch):
             dtype = torch.bool if name == "terminated" else weights.dtype
-            _check_tensor(name, rows, self._shapes[name], dtype)
+            check_tensor(name, rows, self._shapes[name], dtype)
 
 
 def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, alpha: float, gamma: float) -> Tensor:
     """Compute gradients of all runs, do one step of Adam and move the targets, for one batch after the other.
 
     Args:
-        runs: K of them, with gradients in one flat buffer that ``step`` reads.
+        runs: K of them, of the same sizes, with gradients in one flat buffer that ``step`` reads.
         rows: contiguous, ``[U, K, B, ...]``, of the dtypes of those that the runs were made with.
         step: its count of steps is not changed.
         alpha: entropy temperature.
@@ -160,7 +168,13 @@ def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, al
 
     Returns:
         Losses of actor and critics, and the entropy, ``[U, K, 3]``.
+
+    Raises:
+        ValueError: if rows have another shape or dtype, or are not contiguous.
     """
+    like, lead = runs[0]._call._like, (len(rows.reward), len(runs))
+    for (name, shape), part in zip(runs[0]._shapes.items(), rows):
+        check_tensor(name, part, (*lead, *shape), torch.bool if name == "terminated" else like.dtype)
     structs = (_Sac * len(runs))(*(run._call.struct for run in runs))
     losses = rows.reward.new_empty(len(rows.reward), len(runs), 3)
     for k, struct in enumerate(structs):
@@ -214,10 +228,11 @@ class NativeDynamics:
     ) -> None:
         weights = network.weights[0]
         (size, features), entries = x.shape, target.shape[-1]
+        _check_size(size)
         _check_network("ensemble", network, features, 2 * entries, weights)
         _check_gradients([network], gradients)
-        _check_tensor("x", x, (size, features), weights.dtype)
-        _check_tensor("target", target, (size, entries), weights.dtype)
+        check_tensor("x", x, (size, features), weights.dtype)
+        check_tensor("target", target, (size, entries), weights.dtype)
         self._call = _Call(
             "dynamics",
             weights,
@@ -322,13 +337,18 @@ def _split(tensors: Sequence[Tensor], counts: Sequence[int]) -> list[Sequence[Te
     return [tensors[end - count : end] for count, end in zip(counts, ends)]
 
 
+def _check_size(size: int) -> None:
+    if size < 1:
+        raise ValueError("a batch has no rows; give at least one")
+
+
 def _check_network(name: str, network: Network, inputs: int, outputs: int, like: Tensor) -> None:
     sizes = [inputs, *(weight.shape[-1] for weight in network.weights)]
     if sizes[-1] != outputs:
         raise ValueError(f"the {name} returns {sizes[-1]} numbers, and {outputs} are wanted")
     for weight, bias, rows, columns in zip(network.weights, network.biases, sizes[:-1], sizes[1:]):
-        _check_tensor(f"a weight of the {name}", weight, (rows, columns), like.dtype)
-        _check_tensor(f"a bias of the {name}", bias, (columns,), like.dtype)
+        check_tensor(f"a weight of the {name}", weight, (rows, columns), like.dtype)
+        check_tensor(f"a bias of the {name}", bias, (columns,), like.dtype)
 
 
 def _check_gradients(networks: Sequence[Network], gradients: Sequence[Tensor]) -> None:
@@ -336,10 +356,15 @@ def _check_gradients(networks: Sequence[Network], gradients: Sequence[Tensor]) -
     if len(gradients) != len(wanted):
         raise ValueError(f"{len(gradients)} gradients for {len(wanted)} weights and biases; give one for each")
     for part, gradient in zip(wanted, gradients):
-        _check_tensor("a gradient", gradient, tuple(part.shape), part.dtype)
+        check_tensor("a gradient", gradient, tuple(part.shape), part.dtype)
 
 
-def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    """Refuse a tensor that native code would read as another one.
+
+    Raises:
+        ValueError: if its shape or dtype differ, or it is not contiguous on the CPU.
+    """
     if tuple(tensor.shape) != shape or tensor.dtype != dtype:
         raise ValueError(f"{name} is {tuple(tensor.shape)} of {tensor.dtype}, and {shape} of {dtype} is wanted")
     if tensor.device.type != "cpu" or not tensor.is_contiguous():

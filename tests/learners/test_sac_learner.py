@@ -370,3 +370,34 @@ def test_other_kinds_of_adam_step_after_native_gradients(make_rows: Rows) -> Non
         learner.update(make_rows(5, 16))
     for key, value in weights(plain).items():
         torch.testing.assert_close(weights(native)[key], value, rtol=0, atol=1e-9)
+
+
+def test_native_updates_take_a_state_and_rows_of_other_numbers(make_rows: Rows) -> None:
+    one = sac_learner(dtype=torch.float32)
+    one.update(make_rows(3, 16, dtype=torch.float32))
+    native, plain = (sac_learner(compile=compile) for compile in (True, False))
+    for learner in (native, plain):
+        learner.load_state_dict(one.state_dict())
+        learner.rng.manual_seed(0)
+    assert native.optimiser.moments()["exp_avg"].dtype == torch.float64
+    rows = make_rows(3, 16)
+    rows["next", "reward"] = rows["next", "reward"].float()
+    for learner in (native, plain):
+        learner.update(rows)
+    for key, value in weights(plain).items():
+        torch.testing.assert_close(weights(native)[key], value, rtol=0, atol=1e-9)
+
+
+def test_native_targets_are_the_critics_where_tau_is_one(make_rows: Rows) -> None:
+    learner = sac_learner(dtype=torch.float32, compile=True)
+    learner.tau = 1.0
+    learner.update(make_rows(3, 16, dtype=torch.float32))
+    buffers = learner.state_dict()
+    assert torch.equal(buffers["targets"], buffers["weights"][-len(buffers["targets"]) :])
+
+
+def test_moments_of_another_length_are_refused(make_rows: Rows) -> None:
+    learner = sac_learner(compile=True)
+    learner.optimiser.moments()["exp_avg"] = torch.zeros(3, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"exp_avg is \(3,\) of torch.float64, and "):
+        learner.update(make_rows(3, 16))

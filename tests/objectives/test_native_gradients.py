@@ -155,6 +155,16 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
     case.policy = case.policy._replace(weights=case.policy.weights[:1])
     with pytest.raises(ValueError, match="the policy returns 5 numbers, and 2 are wanted"):
         case.found()
+    case = Case(SIZES[0])
+    case.targets = case.targets[:1]
+    with pytest.raises(ValueError, match="1 targets for 2 critics"):
+        case.found()
+    case = Case(SIZES[0])
+    case.critics[1] = Case((1, 17, 7, 6, (64, 64), 1)).critics[0]
+    with pytest.raises(ValueError, match=r"a critic has layers .*, the first one .*; give them the same"):
+        case.found()
+    with pytest.raises(ValueError, match="a batch has no rows"):
+        Case((0, *SIZES[0][1:])).found()
     case = Case(SIZES[3], torch.bfloat16)
     with pytest.raises(TypeError, match=r"native gradients are of float32 or float64, not of torch.bfloat16; set"):
         case.found()
@@ -173,7 +183,8 @@ def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeyp
     other.write_text(text.replace("#if defined(__AVX512F__)", "#if !defined(__AVX512F__)"))
     assert other.read_text() != text
     options = native_gradients.SOURCE.options
-    library = Source(path=other, options=options, purpose="code", way_out="fail").library()
+    wished = native_gradients.SOURCE.wished
+    library = Source(path=other, options=options, wished=wished, purpose="code", way_out="fail").library()
     monkeypatch.setattr(native_gradients, "library", lambda: library)
     for sizes in SIZES:
         test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes, torch.float32)
@@ -212,3 +223,15 @@ def test_nothing_is_written_beside_the_gradients() -> None:
     assert all(wide[-64:].isnan().all() and not wide[:-64].isnan().any() for wide in guards)
     for own, right in zip(gradients, case.found()[0]):
         assert torch.equal(own, right)
+
+
+def test_a_compiler_that_does_not_know_what_is_wished_for_does_without(tmp_path: Path) -> None:
+    compiler = tmp_path / "c++"
+    compiler.write_text(
+        '#!/bin/sh\nfor word; do case $word in -fvect*) echo "unknown $word" >&2; exit 1;; esac; done\n'
+        f'exec {find_compiler("install one")} "$@"\n'
+    )
+    compiler.chmod(0o755)
+    command, _ = native_gradients.SOURCE.command(str(compiler))
+    assert not {*native_gradients.SOURCE.wished} & {*command}
+    assert {*native_gradients.SOURCE.options} <= {*command}
