@@ -109,7 +109,8 @@ class NativeSAC:
             "next_noise": (size, acted),
             "weight": (size,),
         }
-        self._check(batch, weights)
+        self._dtype = weights.dtype
+        self.check(batch)
         split = [len(policy.weights) * 2, *(len(critic.weights) * 2 for critic in critics)]
         own, *of_critics = (list(part) for part in _split(gradients, split))
         self._call = _Call(
@@ -150,10 +151,10 @@ class NativeSAC:
         self._call()
         return losses
 
-    def _check(self, batch: Batch, weights: Tensor) -> None:
-        for name, rows in zip(self._shapes, batch):
-            dtype = torch.bool if name == "terminated" else weights.dtype
-            check_tensor(name, rows, self._shapes[name], dtype)
+    def check(self, batch: Batch, *lead: int) -> None:
+        """Refuse rows of other shapes or dtypes than the first ones, with these dimensions before them."""
+        for (name, shape), rows in zip(self._shapes.items(), batch):
+            check_tensor(name, rows, (*lead, *shape), torch.bool if name == "terminated" else self._dtype)
 
 
 def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, alpha: float, gamma: float) -> Tensor:
@@ -172,9 +173,7 @@ def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, al
     Raises:
         ValueError: if rows have another shape or dtype, or are not contiguous.
     """
-    like, lead = runs[0]._call._like, (len(rows.reward), len(runs))
-    for (name, shape), part in zip(runs[0]._shapes.items(), rows):
-        check_tensor(name, part, (*lead, *shape), torch.bool if name == "terminated" else like.dtype)
+    runs[0].check(rows, len(rows.reward), len(runs))
     structs = (_Sac * len(runs))(*(run._call.struct for run in runs))
     losses = rows.reward.new_empty(len(rows.reward), len(runs), 3)
     for k, struct in enumerate(structs):
