@@ -29,6 +29,7 @@ class Source:
 
     Args:
         path: the file.
+        headers: files beside it that it includes.
         options: of the compiler, beside those for this processor.
         wished: more of them, for compilers that know them.
         made_from: what else the code depends on, such as the version of what it includes.
@@ -37,6 +38,7 @@ class Source:
     """
 
     path: Path
+    headers: tuple[Path, ...] = ()
     options: tuple[str, ...]
     wished: tuple[str, ...] = ()
     made_from: str = ""
@@ -52,7 +54,8 @@ class Source:
         """
         # What the compiler predefines names its version and what the processor can do: a home folder may serve others.
         command, predefined = self.command(find_compiler(self.way_out))
-        parts = (self.path.read_text(), predefined, repr(command), self.made_from)
+        texts = (file.read_text() for file in (self.path, *self.headers))
+        parts = (*texts, predefined, repr(command), self.made_from)
         path = folder() / f"{self.path.stem}-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.so"
         if path.exists():
             try:

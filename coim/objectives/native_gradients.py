@@ -25,6 +25,7 @@ from coim.objectives.gradients import Batch, Network
 
 SOURCE = Source(
     path=Path(__file__).with_suffix(".cpp"),
+    headers=(Path(__file__).with_name("native_networks.h"),),
     # -O3 makes nothing faster here, and takes a third longer. Adam needs its loop in vectors, and bare square roots.
     options=("-O2", "-fno-math-errno", "-ffp-contract=fast"),
     wished=("-ftree-loop-vectorize", "-fvect-cost-model=dynamic"),

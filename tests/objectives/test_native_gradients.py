@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shutil
+from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
 
@@ -178,13 +180,12 @@ def test_wide_layers_are_left_to_the_libraries() -> None:
 def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A compiler splits vectors that are wider than the processor's, so that the code for AVX-512 runs anywhere."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    text = native_gradients.SOURCE.path.read_text()
-    other = tmp_path / "other.cpp"
-    other.write_text(text.replace("#if defined(__AVX512F__)", "#if !defined(__AVX512F__)"))
-    assert other.read_text() != text
-    options = native_gradients.SOURCE.options
-    wished = native_gradients.SOURCE.wished
-    library = Source(path=other, options=options, wished=wished, purpose="code", way_out="fail").library()
+    source, (header,) = native_gradients.SOURCE.path, native_gradients.SOURCE.headers
+    other = tmp_path / header.name
+    other.write_text(header.read_text().replace("#if defined(__AVX512F__)", "#if !defined(__AVX512F__)"))
+    assert other.read_text() != header.read_text()
+    copy = Path(shutil.copy(source, tmp_path))
+    library = replace(native_gradients.SOURCE, path=copy, headers=(other,)).library()
     monkeypatch.setattr(native_gradients, "library", lambda: library)
     for sizes in SIZES:
         test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes, torch.float32)
@@ -200,7 +201,7 @@ def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
             checks.append(f"static_assert(offsetof({name}, {field}) == {getattr(structure, field).offset});")
     assert len(checks) == 4 + 6 + 27 + 11 + 15
     file = tmp_path / "check.cpp"
-    file.write_text("#include <cstddef>\n" + native_gradients.SOURCE.path.read_text() + "\n".join(checks))
+    file.write_text(f'#include <cstddef>\n#include "{native_gradients.SOURCE.path}"\n' + "\n".join(checks))
     command, _ = native_gradients.SOURCE.command(find_compiler("install one"))
     native_gradients.SOURCE.run([*command, "-fsyntax-only", str(file), "-o", os.devnull])
 
@@ -235,3 +236,13 @@ def test_a_compiler_that_does_not_know_what_is_wished_for_does_without(tmp_path:
     command, _ = native_gradients.SOURCE.command(str(compiler))
     assert not {*native_gradients.SOURCE.wished} & {*command}
     assert {*native_gradients.SOURCE.options} <= {*command}
+
+
+def test_a_changed_header_is_compiled_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    path, header = tmp_path / "source.cpp", tmp_path / "number.h"
+    path.write_text('#include "number.h"\nextern "C" int number() { return NUMBER; }\n')
+    source = Source(path=path, headers=(header,), options=(), purpose="numbers", way_out="guess")
+    for number in (7, 8):
+        header.write_text(f"#define NUMBER {number}\n")
+        assert source.library().number() == number
