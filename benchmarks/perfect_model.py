@@ -1,0 +1,172 @@
+"""Would imagination help if the model made no error? Bodies chosen as by `grounded`, the simulator as the model.
+
+``python -m benchmarks.perfect_model --out docs/results/perfect_model`` makes hopper runs of the protocol ``pilot`` that
+imagine nothing, or what the simulator says of random bodies, or of the own body's states under fresh actions. A run
+takes 5 to 7 minutes of one core; arms and seeds that are in ``bodies.csv`` already are not run again. ``summary.csv``
+has what each arm earned, and its difference to runs that imagine nothing.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import pandas as pd
+import torch
+import tyro
+from scipy.stats import ttest_1samp
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from coim import CoAdaptation, DesignDone, HopperMorph, RandomDesigns
+from coim.buffers import TransitionBuffer
+from coim.experiments.frames import read_frame
+from coim.experiments.run.atomic_write import telling_full_disk
+from coim.experiments.run.build import SIMULATED_ROWS, build
+from coim.experiments.run.interrupt import on_command_line
+from coim.experiments.run.machine import prepare
+from coim.experiments.run.settings import METHODS, Settings
+from coim.experiments.study.definition import PROTOCOLS
+from coim.tables import Layout
+
+ArmName = Literal["none", "random", "own"]
+PERFECT: dict[str, Any] = {"dream": "simulator", "individual_imagined_share": 0.2}
+ARMS: dict[ArmName, dict[str, Any]] = {
+    "none": {"imagine": "none"},
+    # What `grounded-governed-both` imagines, by a model without error and ungoverned.
+    "random": PERFECT | {"imagine": "random", "imagined_states": "matched"},
+    # Which actions would have been better on this body: nothing of other bodies, and nothing for the population.
+    "own": PERFECT | {"imagine": "known", "imagined_share": 0.0},
+}
+PILOT = dataclasses.replace(PROTOCOLS["pilot"], **METHODS["grounded"])
+# Rows after each episode, of which batches draw 51 to 64 thousand times. A row of its own for each draw, under a body
+# of its own, would take a minute after each episode: to build a body takes four times as long as to move it.
+ROWS = 5_000
+BODIES = Layout(
+    file="bodies.csv",
+    columns={"arm": str, "seed": int, "design": int, "kind": str, "best_return": float},
+    needed=("arm", "seed", "design", "kind", "best_return"),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What is compared."""
+
+    out: Path = Path("runs/perfect_model")
+    """Folder for bodies.csv and summary.csv."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """A run of each arm for each of them."""
+    arms: tuple[ArmName, ...] = ("none", "random", "own")
+    """What is imagined."""
+    sizes: Settings = PILOT
+    """Settings of each run."""
+
+
+class FewBodies(RandomDesigns):
+    """Uniform designs, as many as the simulator has bodies, in turn: it builds each of them once for many rows."""
+
+    def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
+        """Return designs ``[N, *B, D]``: those of the first rows, over and over."""
+        few = super().__call__(design[:SIMULATED_ROWS], rng=rng)
+        return few.repeat(-(-len(design) // SIMULATED_ROWS), *[1] * (design.ndim - 1))[: len(design)]
+
+
+def imagining(settings: Settings, *, own: bool) -> CoAdaptation:
+    """Algorithm 1 that imagines `ROWS` rows after each episode.
+
+    Args:
+        settings: of the run.
+        own: imagine from the states of the body at hand and by its own policy, not the population's.
+    """
+    algorithm = build(HopperMorph, settings)
+    if (imagined := algorithm.imagined) is None:
+        return algorithm
+    if settings.imagine == "random":
+        imagined.generator = FewBodies(algorithm.env.design_spec)
+    whole = imagined.refresh
+
+    def refresh(
+        pop: TransitionBuffer, policy: TensorDictModuleBase, num_rows: int, **streams: torch.Generator
+    ) -> dict[str, Tensor]:
+        if own:
+            pop, policy = algorithm.buffers.ind, algorithm.individual.policy
+        return whole(pop, policy, min(num_rows, ROWS), **streams)
+
+    setattr(imagined, "refresh", refresh)  # noqa: B010
+    return algorithm
+
+
+def main(comparison: Comparison) -> None:
+    """Run what is missing, then summarise everything."""
+    prepare(1, torch.device("cpu"))
+    comparison.out.mkdir(parents=True, exist_ok=True)
+    path = comparison.out / BODIES.file
+    if not path.exists():
+        write(path, [BODIES.header()])
+    for seed in comparison.seeds:
+        for arm in comparison.arms:
+            done = {*read_frame(path, BODIES)[["arm", "seed"]].itertuples(index=False, name=None)}
+            if (arm, seed) not in done:
+                settings = dataclasses.replace(comparison.sizes, seed=seed, **ARMS[arm])
+                write(path, [[arm, seed, *row] for row in bodies(imagining(settings, own=arm == "own"))])
+    summary = summarise(read_frame(path, BODIES))
+    summary.to_csv(comparison.out / "summary.csv", index=False, float_format="%.5g", lineterminator="\n")
+    print(summary.to_string(index=False, float_format="{:.0f}".format))
+
+
+def bodies(algorithm: CoAdaptation) -> Iterator[list]:
+    """The bodies of a run: design, kind, best return."""
+    for event in algorithm:
+        if isinstance(event, DesignDone):
+            yield [event.index + 1, event.kind, f"{float(event.best_return):.7g}"]
+
+
+def summarise(rows: pd.DataFrame) -> pd.DataFrame:
+    """Means over runs, and those of the differences to runs that imagine nothing, seed by seed.
+
+    Args:
+        rows: of ``bodies.csv``.
+
+    Returns:
+        Columns ``arm, measure, runs, mean, difference, low, high, p``: Student's 95 % interval and test of the
+        difference. ``area``: mean best return of a run's bodies. ``final``: the highest. ``first``, ``optimised``,
+        ``random``: the mean of such bodies.
+    """
+    runs = rows.groupby(["arm", "seed"])["best_return"].agg(area="mean", final="max")
+    kinds = rows.pivot_table(index=["arm", "seed"], columns="kind", values="best_return")
+    measured = runs.join(kinds)
+    table: list[dict[str, object]] = []
+    for arm in ARMS:
+        if arm not in measured.index.levels[0]:
+            continue
+        for measure, values in measured.loc[arm].items():
+            row: dict[str, object] = {"arm": arm, "measure": measure, "runs": len(values), "mean": values.mean()}
+            if arm != "none":
+                row |= compared(values - measured.loc["none"][measure])
+            table.append(row)
+    return pd.DataFrame(table, columns=["arm", "measure", "runs", "mean", "difference", "low", "high", "p"])
+
+
+def compared(differences: pd.Series) -> dict[str, float]:
+    """Mean of the differences of the seeds that both arms have, with its interval and the test that it is nothing."""
+    found = differences.dropna()
+    if len(found) < 2:
+        return {"difference": found.mean()}
+    test = ttest_1samp(found, 0)
+    low, high = test.confidence_interval()
+    return {"difference": found.mean(), "low": float(low), "high": float(high), "p": float(test.pvalue)}
+
+
+def write(path: Path, rows: list[list]) -> None:
+    """Append rows to a CSV file: all of a run, or none."""
+    with telling_full_disk(path), path.open("a", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+if __name__ == "__main__":
+    with on_command_line(own_process=True, again="the same command goes on with the next run"):
+        main(tyro.cli(Comparison, prog="python -m benchmarks.perfect_model", description=__doc__))
