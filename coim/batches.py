@@ -38,6 +38,13 @@ def sample_batches(
 
     Raises:
         ValueError: if the buffer is empty or a number is below 1.
+
+    Example:
+        >>> from coim import HopperMorph, TransitionBuffer, transition_rows
+        >>> buffer = TransitionBuffer(100, num_runs=1, seed=0)
+        >>> _ = buffer.extend(transition_rows(HopperMorph(seed=0).rollout(20)).transpose(0, 1))
+        >>> sample_batches(buffer, batch_size=32, num_batches=5).shape
+        torch.Size([5, 32, 1])
     """
     if min(batch_size, num_batches) < 1:
         raise ValueError(f"{num_batches} batches of {batch_size} rows: both numbers must be at least 1")

@@ -48,6 +48,12 @@ def transition_rows(transitions: TensorDictBase) -> TensorDict:
 
     Raises:
         ValueError: if an entry of the schema is missing, or has not one dimension more than the batch.
+
+    Example:
+        >>> from coim import HopperMorph
+        >>> rollout = HopperMorph(seed=0).rollout(5)
+        >>> sorted(transition_rows(rollout)["next"].keys())
+        ['design', 'done', 'observation', 'reward', 'terminated', 'truncated']
     """
     missing = [key for key in ROW_KEYS if key not in transitions.keys(include_nested=True)]
     if missing:

@@ -69,6 +69,25 @@ class CoAdaptation:
 
         Evaluation episodes leave no trace in the replay. The predecessor's code also skips training in the first three
         episodes of a design and population training in the first designs; the paper has no such rule.
+
+    Example:
+        >>> from coim import DesignDone, GradientSearch, HopperMorph, make_policy, make_qvalue
+        >>> env, evaluation_env = (HopperMorph(seed=seed, episode_steps=20) for seed in (0, 1))
+        >>> first = torch.tensor([[[1.0] * 4], [[1.5] * 4]])
+        >>> algorithm = CoAdaptation(
+        ...     env,
+        ...     evaluation_env,
+        ...     population=SACLearner(make_policy(env), make_qvalue(env), seed=2),
+        ...     individual=SACLearner(make_policy(env), make_qvalue(env), seed=3),
+        ...     buffers=Buffers.for_env(env, pop_capacity=60, ind_capacity=20, s0_capacity=3, art_capacity=1, seed=4),
+        ...     design_choice=DesignChoice(env.design_spec, first, search=GradientSearch(env.design_spec, seed=5)),
+        ...     num_designs=3,
+        ...     first_episodes=1,
+        ...     episodes=1,
+        ...     updates=UpdatePlan(individual_updates=2, population_updates=1),
+        ... )
+        >>> [event.kind for event in algorithm if isinstance(event, DesignDone)]
+        ['first', 'first', 'optimised']
     """
 
     def __init__(

@@ -52,6 +52,18 @@ class ImaginedReplay:
         ValueError: if ``states_are`` or ``actions`` is unknown, or the bodies' lengths are not known as functions of
             their designs and states are to be matched.
 
+    Example:
+        >>> from coim import HopperMorph, RandomDesigns, make_policy, transition_rows
+        >>> env = HopperMorph(seed=0)
+        >>> pop, art = (TransitionBuffer(100, num_runs=1, seed=0) for _ in range(2))
+        >>> _ = pop.extend(transition_rows(env.rollout(20)).transpose(0, 1))
+        >>> dream = WorldModelEnv(GaussianEnsemble.for_env(env, num_cells=(8,)), env, batch_size=env.batch_size)
+        >>> imagined = ImaginedReplay(art, dream, RandomDesigns(env.design_spec), states_are="matched")
+        >>> imagined.refresh(pop, make_policy(env), 50, rng=torch.Generator())
+        {'impossible': tensor([0.])}
+        >>> len(art)
+        50
+
     Attributes:
         counts: whether impossible pairs are counted. Not where the bodies cannot tell how high they stand (see
             `coim.envs.kinematics`), and not in a run that was begun before they were, whose tables have no column.

@@ -18,7 +18,15 @@ from .bounds import bounds_for, bounds_of
 
 
 class DesignGenerator(Protocol):
-    """A generator G of Eq. 7-8: :func:`coim.imagine` gets the designs of imagined rows from it."""
+    """A generator G of Eq. 7-8: :func:`coim.imagine` gets the designs of imagined rows from it.
+
+    Example:
+        >>> class Taller:
+        ...     def __call__(self, design, *, rng=None):
+        ...         return (1.1 * design).clamp(0.5, 2.0)
+        >>> Taller()(torch.tensor([[1.0, 1.9]]))
+        tensor([[1.1000, 2.0000]])
+    """
 
     def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
         """Return the designs ``[*B, D]`` to imagine, given the designs ``[*B, D]`` of the stored rows."""

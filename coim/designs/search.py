@@ -23,6 +23,16 @@ class DesignSearch(Protocol):
 
     If its random numbers continue from call to call, it also needs ``state_dict`` and ``load_state_dict``. Without
     them, a resumed run draws other numbers than an uninterrupted one.
+
+    Example:
+        >>> import torch
+        >>> class Corners:
+        ...     def maximise(self, fitness):
+        ...         designs = torch.cartesian_prod(*[torch.tensor([0.5, 2.0])] * 2)
+        ...         values = fitness(designs)
+        ...         return designs[values.argmax()], float(values.max())
+        >>> Corners().maximise(lambda designs: designs @ torch.tensor([1.0, -1.0]))
+        (tensor([2.0000, 0.5000]), 1.5)
     """
 
     def maximise(self, fitness: Fitness) -> tuple[Tensor, float]:

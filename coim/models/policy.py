@@ -36,6 +36,12 @@ class PolicyNetwork(nn.Module):
         num_cells: units of each hidden layer.
         num_runs: ``K``, or None for a single run.
         scaling: of the inputs; None takes them as they are.
+
+    Example:
+        >>> network = PolicyNetwork(11, 4, 3, num_cells=(32,))
+        >>> loc, scale = network(torch.zeros(5, 11), torch.ones(5, 4))
+        >>> loc.shape, scale.shape
+        (torch.Size([5, 3]), torch.Size([5, 3]))
     """
 
     mlp: StackedMLP
@@ -129,6 +135,13 @@ class Policy(ProbabilisticActor):
 
     Args:
         network: ``(observation, design) -> (loc, scale)``, kept as ``policy.network``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> policy = Policy(PolicyNetwork(11, 4, 3, num_cells=(32,)))
+        >>> td = policy(TensorDict({"observation": torch.zeros(5, 11), "design": torch.ones(5, 4)}, [5]))
+        >>> td["action"].shape, td["action_log_prob"].shape
+        (torch.Size([5, 3]), torch.Size([5]))
     """
 
     def __init__(self, network: PolicyNetwork) -> None:

@@ -28,6 +28,11 @@ class QValueNetwork(nn.Module):
         num_cells: units of each hidden layer.
         num_runs: ``K``, or None for a single run.
         scaling: of the inputs; None takes them as they are.
+
+    Example:
+        >>> network = QValueNetwork(11, 3, 4, num_cells=(32,))
+        >>> network(torch.zeros(5, 11), torch.zeros(5, 3), torch.ones(5, 4)).shape
+        torch.Size([5, 2])
     """
 
     def __init__(
@@ -69,6 +74,13 @@ class QValue(TensorDictModule):
 
     Args:
         network: kept as ``qvalue.module``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> qvalue = QValue(QValueNetwork(11, 3, 4, num_critics=1, num_cells=(32,)))
+        >>> row = {"observation": torch.zeros(5, 11), "action": torch.zeros(5, 3), "design": torch.ones(5, 4)}
+        >>> qvalue(TensorDict(row, [5]))["state_action_value"].shape
+        torch.Size([5, 1])
     """
 
     def __init__(self, network: QValueNetwork) -> None:

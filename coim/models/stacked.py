@@ -43,6 +43,10 @@ class StackedLinear(nn.Module):
     Attributes:
         weight: ``[*stack, F, O]``, the transpose of :class:`torch.nn.Linear`'s.
         bias: ``[*stack, O]``.
+
+    Example:
+        >>> StackedLinear(4, 2, stack=(3,))(torch.zeros(3, 10, 4)).shape
+        torch.Size([3, 10, 2])
     """
 
     def __init__(
