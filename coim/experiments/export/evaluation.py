@@ -19,7 +19,15 @@ from coim.tables import DESIGN_PREFIX, Layout, design_columns
 
 EVALUATION = Layout(
     file="evaluation.csv",
-    columns={"episode": int, "return": float, "broken": int, DESIGN_PREFIX: float},
+    columns={
+        "policy": str,
+        "run": float,
+        "seed": int,
+        "episode": int,
+        "return": float,
+        "broken": int,
+        DESIGN_PREFIX: float,
+    },
     needed=("episode", "return"),
 )
 
@@ -33,14 +41,18 @@ def evaluate(taken: Taken, *, episodes: int, seed: int) -> pd.DataFrame:
         seed: of the starts.
 
     Returns:
-        A row for each episode: its number from 1, its return, how often the simulation broke and began again, and the
-        design.
+        A row for each episode: whose policy acted (``best``, ``population``, or the file), of which of K runs, the seed
+        of the starts, the episode's number from 1, its return, how often the simulation broke and began again, and the
+        design. So rows of several evaluations can stand in one table.
     """
     torch.set_num_threads(1)  # as in training: another number could round otherwise
     bodies = taken.bodies(episodes, seed=seed)
     rows = run_episode(bodies, taken.policy, design=taken.design.repeat(episodes, 1), deterministic=True)["next"]
     table = pd.DataFrame(
         {
+            "policy": taken.of,
+            "run": "" if taken.run is None else taken.run,
+            "seed": seed,
             "episode": range(1, episodes + 1),
             "return": rows["reward"].sum(0).flatten().tolist(),
             "broken": rows["terminated"].sum(0).flatten().tolist(),

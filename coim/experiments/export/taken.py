@@ -31,6 +31,8 @@ class Taken:
         design: ``[D]``.
         settings: ``task`` and ``episode_steps`` of its episodes.
         name: of the design, for a reader.
+        of: whose policy it is: ``best`` or ``population``, or the name of the file that it is from.
+        run: one of K; None for a file.
         tried: the design's row in the run; None for lengths that are none of its designs.
     """
 
@@ -39,6 +41,8 @@ class Taken:
     design: Tensor
     settings: dict[str, Any]
     name: str
+    of: str
+    run: int | None
     tried: TriedDesign | None
 
     def bodies(self, number: int, *, seed: int) -> MorphEnv:
@@ -69,7 +73,8 @@ def take(source: Path, design: str, *, run: int | None, policy: Which | None, bo
     if lengths is None and design != "best" and not design.isdecimal():
         raise ValueError(f"--design is {design!r}: choose best, the number of a design, or factors such as 1,1.2,0.8,1")
     number = int(design) if design.isdecimal() else None
-    if lengths is None and policy != "population":
+    own = lengths is None and policy != "population"
+    if own:
         trained = loaded.trained(number)
         tried, chosen = trained.tried, trained.policy
     else:
@@ -77,7 +82,7 @@ def take(source: Path, design: str, *, run: int | None, policy: Which | None, bo
         chosen = loaded.population.policy
         chosen = chosen if chosen.num_runs is None else select_run(chosen, tried.run)
     named = f"design {tried.number} ({tried.kind})" if lengths is None else f"body {design}"
-    if lengths is not None or policy == "population":
+    if not own:
         named += ", the population's policy"
     return Taken(
         policy=chosen.cpu(),
@@ -85,7 +90,9 @@ def take(source: Path, design: str, *, run: int | None, policy: Which | None, bo
         design=tried.design if lengths is None else lengths,
         settings=_episodes(loaded),
         name=named,
-        tried=tried if lengths is None and policy != "population" else None,  # its best return is its own policy's
+        of="best" if own else "population",
+        run=tried.run,
+        tried=tried if own else None,  # its best return is its own policy's
     )
 
 
@@ -130,5 +137,7 @@ def _from_file(path: Path, design: str, body: str | None) -> Taken:
         design=own if design == "best" else numbers(design, kind(device="cpu")),
         settings=told["settings"],
         name=f"{path.name} on its own body" if design == "best" else f"{path.name} on body {design}",
+        of=path.name,
+        run=None,
         tried=None,
     )
