@@ -3,7 +3,7 @@
 ``python -m benchmarks.perfect_model --out docs/results/perfect_model`` makes hopper runs of the protocol ``pilot`` that
 imagine nothing, or what the simulator says of random bodies, or of the own body's states under fresh actions. A run
 takes 5 to 7 minutes of one core; arms and seeds that are in ``bodies.csv`` already are not run again. ``summary.csv``
-has what each arm earned, and its difference to runs that imagine nothing.
+has what each arm earned, and its difference to runs that imagine nothing; ``bodies.png`` draws it body by body.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import matplotlib.pyplot as plt
 import pandas as pd
 import torch
 import tyro
@@ -23,12 +24,16 @@ from torch import Tensor
 
 from coim import CoAdaptation, DesignDone, HopperMorph, RandomDesigns
 from coim.buffers import TransitionBuffer
+from coim.experiments.drawing.curves import draw_mean
+from coim.experiments.drawing.palette import BLACK, BLUE, ORANGE
 from coim.experiments.frames import read_frame
+from coim.experiments.report.summary_png import save
 from coim.experiments.run.atomic_write import telling_full_disk
 from coim.experiments.run.build import SIMULATED_ROWS, build
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import prepare
 from coim.experiments.run.settings import METHODS, Settings
+from coim.experiments.statistics.intervals import mean, over_runs
 from coim.experiments.study.definition import PROTOCOLS
 from coim.tables import Layout
 
@@ -41,6 +46,7 @@ ARMS: dict[ArmName, dict[str, Any]] = {
     # Which actions would have been better on this body: nothing of other bodies, and nothing for the population.
     "own": PERFECT | {"imagine": "known", "imagined_share": 0.0},
 }
+COLOURS: dict[ArmName, str] = {"none": BLUE, "random": BLACK, "own": ORANGE}
 PILOT = dataclasses.replace(PROTOCOLS["pilot"], **METHODS["grounded"])
 # Rows after each episode, of which batches draw 51 to 64 thousand times. A row of its own for each draw, under a body
 # of its own, would take a minute after each episode: to build a body takes four times as long as to move it.
@@ -57,7 +63,7 @@ class Comparison:
     """What is compared."""
 
     out: Path = Path("runs/perfect_model")
-    """Folder for bodies.csv and summary.csv."""
+    """Folder for bodies.csv, summary.csv and bodies.png."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """A run of each arm for each of them."""
     arms: tuple[ArmName, ...] = ("none", "random", "own")
@@ -113,9 +119,11 @@ def main(comparison: Comparison) -> None:
             if (arm, seed) not in done:
                 settings = dataclasses.replace(comparison.sizes, seed=seed, **ARMS[arm])
                 write(path, [[arm, seed, *row] for row in bodies(imagining(settings, own=arm == "own"))])
-    summary = summarise(read_frame(path, BODIES))
+    rows = read_frame(path, BODIES)
+    summary = summarise(rows)
     summary.to_csv(comparison.out / "summary.csv", index=False, float_format="%.5g", lineterminator="\n")
     print(summary.to_string(index=False, float_format="{:.0f}".format))
+    draw(rows, comparison.out / "bodies.png")
 
 
 def bodies(algorithm: CoAdaptation) -> Iterator[list]:
@@ -159,6 +167,22 @@ def compared(differences: pd.Series) -> dict[str, float]:
     test = ttest_1samp(found, 0)
     low, high = test.confidence_interval()
     return {"difference": found.mean(), "low": float(low), "high": float(high), "p": float(test.pvalue)}
+
+
+def draw(rows: pd.DataFrame, path: Path) -> None:
+    """Mean best return of each body of a run, in the order of building, with its 95 % bootstrap interval."""
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    for arm, colour in COLOURS.items():
+        found = rows[rows["arm"] == arm].pivot(index="seed", columns="design", values="best_return")
+        if found.empty:
+            continue
+        value, low, high, _ = over_runs(found.to_numpy(), mean)
+        band = {"low": low, "high": high} if len(found) > 1 else {}
+        draw_mean(axes, found.columns.to_numpy(), value, **band, color=colour, label=f"{arm} ({len(found)} runs)")
+    axes.set(xlabel="body", ylabel="best return, mean over runs")
+    axes.legend(frameon=False, title="what is imagined, by the simulator")
+    axes.spines[["top", "right"]].set_visible(False)
+    save(figure, path)
 
 
 def write(path: Path, rows: list[list]) -> None:

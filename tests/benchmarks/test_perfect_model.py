@@ -40,6 +40,7 @@ def test_every_arm_is_run_once_and_compared(tmp_path: Path, monkeypatch: pytest.
     expected = (area["random"] - area["none"]).mean()
     assert found.loc[("random", "area"), "difference"] == pytest.approx(expected, rel=1e-4)
     assert found.loc[("random", "area"), "low"] <= expected <= found.loc[("random", "area"), "high"]
+    assert (tmp_path / "bodies.png").stat().st_size > 10_000
     before = (tmp_path / "bodies.csv").read_bytes()
     monkeypatch.setattr(perfect_model, "build", None)
     main(asked)
