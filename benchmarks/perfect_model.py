@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.perfect_model --out docs/results/perfect_model`` makes hopper runs of the protocol ``pilot`` that
 imagine nothing, or what the simulator says of random bodies, or of the own body's states under fresh actions. A run
-takes 5 to 7 minutes of one core; arms and seeds that are in ``bodies.csv`` already are not run again. ``summary.csv``
+takes 5 to 7 minutes of one core; those that are whole in ``bodies.csv`` already are not made again. ``summary.csv``
 has what each arm earned, and its difference to runs that imagine nothing; ``bodies.png`` draws it body by body.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +31,7 @@ from coim.experiments.frames import read_frame
 from coim.experiments.report.summary_png import save
 from coim.experiments.run.atomic_write import telling_full_disk
 from coim.experiments.run.build import SIMULATED_ROWS, build
-from coim.experiments.run.interrupt import on_command_line
+from coim.experiments.run.interrupt import locked, on_command_line
 from coim.experiments.run.machine import prepare
 from coim.experiments.run.settings import METHODS, Settings
 from coim.experiments.statistics.intervals import mean, over_runs
@@ -48,8 +49,8 @@ ARMS: dict[ArmName, dict[str, Any]] = {
 }
 COLOURS: dict[ArmName, str] = {"none": BLUE, "random": BLACK, "own": ORANGE}
 PILOT = dataclasses.replace(PROTOCOLS["pilot"], **METHODS["grounded"])
-# Rows after each episode, of which batches draw 51 to 64 thousand times. A row of its own for each draw, under a body
-# of its own, would take a minute after each episode: to build a body takes four times as long as to move it.
+# Rows after each episode, of which batches draw 51 to 64 thousand times. A row for each would take 10 seconds more,
+# and with a body of its own a minute: to build a body takes four times as long as to move it.
 ROWS = 5_000
 BODIES = Layout(
     file="bodies.csv",
@@ -73,7 +74,7 @@ class Comparison:
 
 
 class FewBodies(RandomDesigns):
-    """Uniform designs, as many as the simulator has bodies, in turn: it builds each of them once for many rows."""
+    """Uniform designs, as many as the simulator has bodies, in turn: it builds nearly each of them once."""
 
     def __call__(self, design: Tensor, *, rng: torch.Generator | None = None) -> Tensor:
         """Return designs ``[N, *B, D]``: those of the first rows, over and over."""
@@ -96,34 +97,58 @@ def imagining(settings: Settings, *, own: bool) -> CoAdaptation:
     whole = imagined.refresh
 
     def refresh(
-        pop: TransitionBuffer, policy: TensorDictModuleBase, num_rows: int, **streams: torch.Generator
+        pop: TransitionBuffer, policy: TensorDictModuleBase, num_rows: int, **streams: torch.Generator | None
     ) -> dict[str, Tensor]:
         if own:
             pop, policy = algorithm.buffers.ind, algorithm.individual.policy
         return whole(pop, policy, min(num_rows, ROWS), **streams)
 
-    setattr(imagined, "refresh", refresh)  # noqa: B010
+    imagined.refresh = refresh
     return algorithm
 
 
 def main(comparison: Comparison) -> None:
-    """Run what is missing, then summarise everything."""
+    """Make the runs that are missing, then summarise everything.
+
+    Raises:
+        ValueError: if a run in the table has another number of bodies.
+        BlockingIOError: if another process writes to the folder.
+    """
     prepare(1, torch.device("cpu"))
     comparison.out.mkdir(parents=True, exist_ok=True)
     path = comparison.out / BODIES.file
-    if not path.exists():
-        write(path, [BODIES.header()])
-    for seed in comparison.seeds:
-        for arm in comparison.arms:
-            done = {*read_frame(path, BODIES)[["arm", "seed"]].itertuples(index=False, name=None)}
+    with locked(comparison.out):
+        if not path.exists():
+            write(path, [BODIES.header()])
+        done = whole_runs(path, comparison.sizes.num_designs)
+        for seed, arm in product(comparison.seeds, comparison.arms):
             if (arm, seed) not in done:
                 settings = dataclasses.replace(comparison.sizes, seed=seed, **ARMS[arm])
-                write(path, [[arm, seed, *row] for row in bodies(imagining(settings, own=arm == "own"))])
-    rows = read_frame(path, BODIES)
-    summary = summarise(rows)
-    summary.to_csv(comparison.out / "summary.csv", index=False, float_format="%.5g", lineterminator="\n")
-    print(summary.to_string(index=False, float_format="{:.0f}".format))
-    draw(rows, comparison.out / "bodies.png")
+                found = [*bodies(imagining(settings, own=arm == "own"))]
+                write(path, [[arm, seed, *row] for row in found])
+                print(f"{arm}, seed {seed}: {sum(float(row[-1]) for row in found) / len(found):.0f}", flush=True)
+        rows = read_frame(path, BODIES)
+        summary = summarise(rows)
+        summary.to_csv(comparison.out / "summary.csv", index=False, float_format="%.5g", lineterminator="\n")
+        print(summary.to_string(index=False, float_format="{:.0f}".format, formatters={"p": "{:.2g}".format}))
+        draw(rows, comparison.out / "bodies.png")
+
+
+def whole_runs(path: Path, num_designs: int) -> set[tuple[str, int]]:
+    """Arms and seeds in the table.
+
+    Raises:
+        ValueError: if a run there is no run of so many bodies.
+    """
+    found = set()
+    for (arm, seed), run in read_frame(path, BODIES).groupby(["arm", "seed"]):
+        if sorted(run["design"]) != [*range(1, num_designs + 1)]:
+            raise ValueError(
+                f"{path} has {len(run)} rows of {arm} with seed {seed}, and a run has {num_designs} bodies; delete "
+                "these rows, or name another folder with --out"
+            )
+        found.add((arm, seed))
+    return found
 
 
 def bodies(algorithm: CoAdaptation) -> Iterator[list]:
@@ -140,9 +165,9 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
         rows: of ``bodies.csv``.
 
     Returns:
-        Columns ``arm, measure, runs, mean, difference, low, high, p``: Student's 95 % interval and test of the
-        difference. ``area``: mean best return of a run's bodies. ``final``: the highest. ``first``, ``optimised``,
-        ``random``: the mean of such bodies.
+        Columns ``arm, measure, runs, mean, pairs, difference, low, high, p``: the mean of the arm's runs; and, of the
+        seeds that both arms have, the difference with Student's 95 % interval and test. ``area``: mean best return of a
+        run's bodies. ``final``: the highest. ``first``, ``optimised``, ``random``: the mean of such bodies.
     """
     runs = rows.groupby(["arm", "seed"])["best_return"].agg(area="mean", final="max")
     kinds = rows.pivot_table(index=["arm", "seed"], columns="kind", values="best_return")
@@ -152,21 +177,22 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
         if arm not in measured.index.levels[0]:
             continue
         for measure, values in measured.loc[arm].items():
-            row: dict[str, object] = {"arm": arm, "measure": measure, "runs": len(values), "mean": values.mean()}
-            if arm != "none":
+            row: dict[str, object] = {"arm": arm, "measure": measure, "runs": values.count(), "mean": values.mean()}
+            if arm != "none" and "none" in measured.index.levels[0]:
                 row |= compared(values - measured.loc["none"][measure])
             table.append(row)
-    return pd.DataFrame(table, columns=["arm", "measure", "runs", "mean", "difference", "low", "high", "p"])
+    return pd.DataFrame(table, columns=["arm", "measure", "runs", "mean", "pairs", "difference", "low", "high", "p"])
 
 
 def compared(differences: pd.Series) -> dict[str, float]:
     """Mean of the differences of the seeds that both arms have, with its interval and the test that it is nothing."""
-    found = differences.dropna()
-    if len(found) < 2:
-        return {"difference": found.mean()}
-    test = ttest_1samp(found, 0)
+    paired = differences.dropna()
+    row = {"pairs": len(paired), "difference": paired.mean()}
+    if len(paired) < 2:
+        return row
+    test = ttest_1samp(paired, 0)
     low, high = test.confidence_interval()
-    return {"difference": found.mean(), "low": float(low), "high": float(high), "p": float(test.pvalue)}
+    return row | {"low": float(low), "high": float(high), "p": float(test.pvalue)}
 
 
 def draw(rows: pd.DataFrame, path: Path) -> None:
@@ -186,7 +212,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 
 
 def write(path: Path, rows: list[list]) -> None:
-    """Append rows to a CSV file: all of a run, or none."""
+    """Append the rows of a run to a CSV file."""
     with telling_full_disk(path), path.open("a", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 

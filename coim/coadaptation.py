@@ -71,9 +71,11 @@ class CoAdaptation:
         episodes of a design and population training in the first designs; the paper has no such rule.
 
     Example:
-        >>> from coim import DesignDone, GradientSearch, HopperMorph, make_policy, make_qvalue
+        >>> import torch
+        >>> from coim import Buffers, DesignChoice, DesignDone, GradientSearch, HopperMorph, SACLearner, UpdatePlan
+        >>> from coim import make_policy, make_qvalue
         >>> env, evaluation_env = (HopperMorph(seed=seed, episode_steps=20) for seed in (0, 1))
-        >>> first = torch.tensor([[[1.0] * 4], [[1.5] * 4]])
+        >>> first = torch.tensor([[1.0] * 4, [1.5] * 4])
         >>> algorithm = CoAdaptation(
         ...     env,
         ...     evaluation_env,

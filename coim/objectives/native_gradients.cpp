@@ -1,7 +1,8 @@
 // The gradients of gradients.py and dynamics_gradients.py for one network (or one policy with its critics) on a CPU, in one
-// call, up to rounding. Compiled by coim/native.py and called by native_gradients.py, whose structures are the ones below.
+// call, up to rounding. Compiled by coim/native.py and called by native_gradients.py, whose structures are those of here and
+// of native_networks.h.
 //
-// Shapes: B batch, S observation, D design, A action, F inputs of a layer, O its outputs.
+// Shapes: B batch, S observation, D design, A action, F inputs of a layer.
 
 #include "native_networks.h"
 

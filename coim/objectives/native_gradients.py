@@ -262,7 +262,7 @@ class NativeDynamics:
 
 
 class _Layer(ctypes.Structure):
-    """As in the source, where the fields are explained; as the next two."""
+    """As in ``native_networks.h``; the next two as in the source. There the fields are explained."""
 
     _fields_ = [(name, ctypes.c_void_p) for name in ("weight", "bias", "weight_gradient", "bias_gradient")] + [
         (name, ctypes.c_int64) for name in ("inputs", "outputs")

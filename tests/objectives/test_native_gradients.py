@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shutil
 from dataclasses import replace
 from itertools import chain, pairwise
@@ -246,3 +247,13 @@ def test_a_changed_header_is_compiled_anew(tmp_path: Path, monkeypatch: pytest.M
     for number in (7, 8):
         header.write_text(f"#define NUMBER {number}\n")
         assert source.library().number() == number
+
+
+def test_every_header_that_is_included_is_named() -> None:
+    source = native_gradients.SOURCE
+    included = [
+        source.path.with_name(name)
+        for path in (source.path, *source.headers)
+        for name in re.findall(r'#include "([^"]+)"', path.read_text())
+    ]
+    assert included == [*source.headers]

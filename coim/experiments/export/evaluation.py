@@ -13,19 +13,20 @@ import torch
 from coim.episode import run_episode
 from coim.experiments.export.taken import Taken
 from coim.experiments.frames import rows_of
-from coim.experiments.run.atomic_write import as_csv, naming_out, shortest, write_whole
+from coim.experiments.run.atomic_write import as_csv, naming_out, readable, shortest, write_whole
 from coim.experiments.run.records import number
 from coim.tables import DESIGN_PREFIX, Layout, design_columns
 
 EVALUATION = Layout(
     file="evaluation.csv",
     columns={
+        "source": str,
         "policy": str,
         "run": float,
-        "seed": int,
+        "seed": float,  # this one and the next have no cells in tables of earlier versions
+        "broken": float,
         "episode": int,
         "return": float,
-        "broken": int,
         DESIGN_PREFIX: float,
     },
     needed=("episode", "return"),
@@ -41,21 +42,22 @@ def evaluate(taken: Taken, *, episodes: int, seed: int) -> pd.DataFrame:
         seed: of the starts.
 
     Returns:
-        A row for each episode: whose policy acted (``best``, ``population``, or the file), of which of K runs, the seed
-        of the starts, the episode's number from 1, its return, how often the simulation broke and began again, and the
-        design. So rows of several evaluations can stand in one table.
+        A row for each episode: the folder or file that was named, whose policy acted (``best`` or ``population``; a
+        file does not say), of which of K runs, the seed of the starts, how often the simulation broke and began again,
+        the episode's number from 1, its return, and the design. So rows of several evaluations can stand in one table.
     """
     torch.set_num_threads(1)  # as in training: another number could round otherwise
     bodies = taken.bodies(episodes, seed=seed)
     rows = run_episode(bodies, taken.policy, design=taken.design.repeat(episodes, 1), deterministic=True)["next"]
     table = pd.DataFrame(
         {
+            "source": readable(str(taken.source)),
             "policy": taken.of,
             "run": "" if taken.run is None else taken.run,
             "seed": seed,
+            "broken": rows["terminated"].sum(0).flatten().tolist(),
             "episode": range(1, episodes + 1),
             "return": rows["reward"].sum(0).flatten().tolist(),
-            "broken": rows["terminated"].sum(0).flatten().tolist(),
         }
     )
     for name, factor in zip(design_columns(bodies.design_names()), taken.design.tolist()):

@@ -31,7 +31,8 @@ class Taken:
         design: ``[D]``.
         settings: ``task`` and ``episode_steps`` of its episodes.
         name: of the design, for a reader.
-        of: whose policy it is: ``best`` or ``population``, or the name of the file that it is from.
+        source: the folder or file that it is from.
+        of: whose policy it is: ``best`` or ``population``; empty for a file.
         run: one of K; None for a file.
         tried: the design's row in the run; None for lengths that are none of its designs.
     """
@@ -41,6 +42,7 @@ class Taken:
     design: Tensor
     settings: dict[str, Any]
     name: str
+    source: Path
     of: str
     run: int | None
     tried: TriedDesign | None
@@ -90,6 +92,7 @@ def take(source: Path, design: str, *, run: int | None, policy: Which | None, bo
         design=tried.design if lengths is None else lengths,
         settings=_episodes(loaded),
         name=named,
+        source=source,
         of="best" if own else "population",
         run=tried.run,
         tried=tried if own else None,  # its best return is its own policy's
@@ -137,7 +140,8 @@ def _from_file(path: Path, design: str, body: str | None) -> Taken:
         design=own if design == "best" else numbers(design, kind(device="cpu")),
         settings=told["settings"],
         name=f"{path.name} on its own body" if design == "best" else f"{path.name} on body {design}",
-        of=path.name,
+        source=path,
+        of="",
         run=None,
         tried=None,
     )

@@ -17,6 +17,8 @@ from coim import HopperMorph, load_run
 from coim.envs.blueprint import observed
 from coim.experiments.commands import evaluate, export
 from coim.experiments.export import actor, write
+from coim.experiments.export.evaluation import EVALUATION
+from coim.experiments.frames import read_frame
 from coim.models import Policy, PolicyNetwork, select_run
 
 NEEDS = {".onnx": ("onnx", "onnxruntime"), ".safetensors": ("safetensors",), ".pt2": ()}
@@ -119,11 +121,14 @@ def test_an_evaluation_repeats_itself_and_an_exported_policy_earns_the_same(
     rows = rows_in(table)
     assert [row["episode"] for row in rows] == ["1", "2", "3"]
     assert len({row["return"] for row in rows}) == 3  # another start for each
-    assert {(row["policy"], row["run"], row["seed"]) for row in rows} == {("best", str(best.run), "0")}
+    told = {(row["source"], row["policy"], row["run"], row["seed"]) for row in rows}
+    assert told == {(str(fleet), "best", str(best.run), "0")}
+    assert read_frame(table, EVALUATION)["return"].tolist() == [float(row["return"]) for row in rows]
     export.main([str(fleet), "--to", str(tmp_path / "out" / "policy.pt2")])
     evaluated(capsys, str(tmp_path / "out" / "policy.pt2"), "--episodes", "3", "--out", str(exported))
     for row, other in zip(rows, rows_in(exported), strict=True):
-        assert (other["policy"], other["run"]) == ("policy.pt2", "")
+        assert other["source"] == str(tmp_path / "out" / "policy.pt2")
+        assert (other["policy"], other["run"]) == ("", "")
         assert float(row["return"]) == pytest.approx(float(other["return"]), rel=1e-4)
 
 
@@ -132,7 +137,7 @@ def test_lengths_that_are_no_design_have_the_populations_policy(fleet: Path, cap
     assert lines[0].startswith("body 1,2,0.5,1, the population's policy: return ")
     assert lines[1] == str(fleet / "evaluation.csv")
     (row,) = rows_in(fleet / "evaluation.csv")
-    assert row["policy"] == "population"
+    assert (row["policy"], row["run"]) == ("population", str(load_run(fleet).best.tried.run))
     assert (row["xi_thigh"], row["xi_shank"]) == ("2.0", "0.5")
 
 
