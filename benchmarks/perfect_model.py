@@ -206,6 +206,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         band = {"low": low, "high": high} if len(found) > 1 else {}
         draw_mean(axes, found.columns.to_numpy(), value, **band, color=colour, label=f"{arm} ({len(found)} runs)")
     axes.set(xlabel="body", ylabel="best return, mean over runs")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend(frameon=False, title="what is imagined, by the simulator")
     axes.spines[["top", "right"]].set_visible(False)
     save(figure, path)
