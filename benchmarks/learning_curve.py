@@ -7,7 +7,6 @@ writes the evaluation returns of every episode and seed, the random policy's ret
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from pathlib import Path
 from typing import Literal
@@ -17,10 +16,10 @@ import pandas as pd
 import torch
 import tyro
 
+from benchmarks.appending import append_rows
 from coim import EpisodeDone, HalfCheetahMorph, run_episode
 from coim.experiments.frames import read_frame
 from coim.experiments.report.summary_png import save
-from coim.experiments.run.atomic_write import telling_full_disk
 from coim.experiments.run.build import build
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import available_cores, checked_device, prepare
@@ -65,14 +64,14 @@ def main(curve: Curve) -> None:
     curve.out.mkdir(parents=True, exist_ok=True)
     path = curve.out / CURVES.file
     if not path.exists():
-        write(path, [CURVES.header()])
+        append_rows(path, [CURVES.header()])
     done = {*read(path)[["arm", "seed"]].itertuples(index=False, name=None)}
     for seed in curve.seeds:
         for arm in curve.arms:
             if (arm, seed) not in done:
-                write(path, returns(arm, dataclasses.replace(ARMS[arm], seed=seed), curve.episodes))
+                append_rows(path, returns(arm, dataclasses.replace(ARMS[arm], seed=seed), curve.episodes))
     if not (read(path)["arm"] == "random policy").any():
-        write(path, [["random policy", 0, i + 1, value] for i, value in enumerate(random_returns(curve))])
+        append_rows(path, [["random policy", 0, i + 1, value] for i, value in enumerate(random_returns(curve))])
     summarise(curve, read(path))
 
 
@@ -122,19 +121,13 @@ def summarise(curve: Curve, rows: pd.DataFrame) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     save(figure, curve.out / "curves.png")
     (curve.out / "summary.csv").unlink(missing_ok=True)
-    write(curve.out / "summary.csv", table)
+    append_rows(curve.out / "summary.csv", table)
     print(*(",".join(map(str, row)) for row in table), sep="\n")
 
 
 def read(path: Path) -> pd.DataFrame:
     """Rows of ``curves.csv``."""
     return read_frame(path, CURVES)
-
-
-def write(path: Path, rows: list[list]) -> None:
-    """Append rows to a CSV file."""
-    with telling_full_disk(path), path.open("a", newline="") as file:
-        csv.writer(file).writerows(rows)
 
 
 if __name__ == "__main__":

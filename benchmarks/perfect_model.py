@@ -8,7 +8,6 @@ has what each arm earned, and its difference to runs that imagine nothing; ``bod
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Iterator
 from itertools import product
@@ -23,13 +22,13 @@ from scipy.stats import ttest_1samp
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from benchmarks.appending import append_rows
 from coim import CoAdaptation, DesignDone, HopperMorph, RandomDesigns
 from coim.buffers import TransitionBuffer
 from coim.experiments.drawing.curves import draw_mean
 from coim.experiments.drawing.palette import BLACK, BLUE, ORANGE
 from coim.experiments.frames import read_frame
 from coim.experiments.report.summary_png import save
-from coim.experiments.run.atomic_write import telling_full_disk
 from coim.experiments.run.build import SIMULATED_ROWS, build
 from coim.experiments.run.interrupt import locked, on_command_line
 from coim.experiments.run.machine import prepare
@@ -119,13 +118,13 @@ def main(comparison: Comparison) -> None:
     path = comparison.out / BODIES.file
     with locked(comparison.out):
         if not path.exists():
-            write(path, [BODIES.header()])
+            append_rows(path, [BODIES.header()])
         done = whole_runs(path, comparison.sizes.num_designs)
         for seed, arm in product(comparison.seeds, comparison.arms):
             if (arm, seed) not in done:
                 settings = dataclasses.replace(comparison.sizes, seed=seed, **ARMS[arm])
                 found = [*bodies(imagining(settings, own=arm == "own"))]
-                write(path, [[arm, seed, *row] for row in found])
+                append_rows(path, [[arm, seed, *row] for row in found])
                 print(f"{arm}, seed {seed}: {sum(float(row[-1]) for row in found) / len(found):.0f}", flush=True)
         rows = read_frame(path, BODIES)
         summary = summarise(rows)
@@ -210,12 +209,6 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     axes.legend(frameon=False, title="what is imagined, by the simulator")
     axes.spines[["top", "right"]].set_visible(False)
     save(figure, path)
-
-
-def write(path: Path, rows: list[list]) -> None:
-    """Append the rows of a run to a CSV file."""
-    with telling_full_disk(path), path.open("a", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ and governed. A seed is five runs in lock-step; seeds that are in ``curves.csv``
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,12 +22,12 @@ import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from benchmarks.appending import append_rows
 from coim import CoAdaptation, DynamicsLearner, EpisodeDone, HopperMorph
 from coim.experiments.drawing.curves import draw_mean
 from coim.experiments.drawing.palette import BLACK, BLUE, VERMILION, Dashes
 from coim.experiments.frames import read_frame
 from coim.experiments.report.summary_png import save
-from coim.experiments.run.atomic_write import telling_full_disk
 from coim.experiments.run.build import build
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import prepare
@@ -154,13 +153,13 @@ def main(comparison: Comparison) -> None:
     comparison.out.mkdir(parents=True, exist_ok=True)
     path = comparison.out / CURVES.file
     if not path.exists():
-        write(path, [CURVES.header()])
+        append_rows(path, [CURVES.header()])
     done = {*read_frame(path, CURVES)[["arm", "seed"]].itertuples(index=False, name=None)}
     for seed in comparison.seeds:
         for name, arm in ARMS.items():
             if (name, seed) not in done:
                 settings = dataclasses.replace(comparison.sizes, seed=seed, **arm.settings)
-                write(path, [*returns(name, settings, arm.spoilt)])
+                append_rows(path, [*returns(name, settings, arm.spoilt)])
     rows = read_frame(path, CURVES)
     summary = summarise(rows)
     summary.to_csv(comparison.out / "summary.csv", index=False, float_format="%.5g", lineterminator="\n")
@@ -229,12 +228,6 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     save(figure, path)
-
-
-def write(path: Path, rows: list[list]) -> None:
-    """Append rows to a CSV file: all of an arm and seed, or none."""
-    with telling_full_disk(path), path.open("a", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 if __name__ == "__main__":

@@ -23,10 +23,10 @@ EVALUATION = Layout(
         "source": str,
         "policy": str,
         "run": float,
-        "seed": float,  # this one and the next have no cells in tables of earlier versions
-        "broken": float,
+        "seed": float,  # has no cells in tables of earlier versions, nor has `broken`
         "episode": int,
         "return": float,
+        "broken": float,
         DESIGN_PREFIX: float,
     },
     needed=("episode", "return"),
@@ -43,8 +43,9 @@ def evaluate(taken: Taken, *, episodes: int, seed: int) -> pd.DataFrame:
 
     Returns:
         A row for each episode: the folder or file that was named, whose policy acted (``best`` or ``population``; a
-        file does not say), of which of K runs, the seed of the starts, how often the simulation broke and began again,
-        the episode's number from 1, its return, and the design. So rows of several evaluations can stand in one table.
+        file does not say), of which of K runs, the seed of the starts, the episode's number from 1, its return, how
+        often the simulation broke and began again, and the design. So rows of several evaluations can stand in one
+        table.
     """
     torch.set_num_threads(1)  # as in training: another number could round otherwise
     bodies = taken.bodies(episodes, seed=seed)
@@ -55,9 +56,9 @@ def evaluate(taken: Taken, *, episodes: int, seed: int) -> pd.DataFrame:
             "policy": taken.of,
             "run": "" if taken.run is None else taken.run,
             "seed": seed,
-            "broken": rows["terminated"].sum(0).flatten().tolist(),
             "episode": range(1, episodes + 1),
             "return": rows["reward"].sum(0).flatten().tolist(),
+            "broken": rows["terminated"].sum(0).flatten().tolist(),
         }
     )
     for name, factor in zip(design_columns(bodies.design_names()), taken.design.tolist()):
