@@ -6,13 +6,19 @@ from coim.experiments.study.definition import Block, Study
 
 SEEDS = tuple(range(10))
 # A method is developed on the first seeds and confirmed on the others, by which nothing may be chosen.
-DEVELOP, CONFIRM, FLEET = tuple(range(5)), tuple(range(20, 30)), tuple(range(30, 40))
+DEVELOP, CONFIRM, FLEET, REACH = tuple(range(5)), tuple(range(20, 30)), tuple(range(30, 40)), tuple(range(40, 50))
 
 
 def bodies(name: str, seeds: tuple[int, ...]) -> Study:
     """Ways of choosing bodies, all without imagination."""
     arms = ("none", "random-bodies", "matched", "visited", "returns", "posterior", "grounded")
     return Study(name=name, environments=("hopper",), arms=arms, seeds=seeds, protocol="pilot")
+
+
+def bodies_with_and_without_reach() -> Study:
+    """Whether it pays to search near the best body at first, as `grounded` does and the others do not."""
+    arms = ("grounded", "posterior", "returns", "random-bodies")
+    return Study(name="bodies-reach", environments=("hopper",), arms=arms, seeds=REACH, protocol="pilot")
 
 
 def bodies_in_fleets() -> Study:
@@ -71,6 +77,7 @@ STUDIES = {
         ),
         bodies("bodies-develop", DEVELOP),
         bodies("bodies", CONFIRM),
+        bodies_with_and_without_reach(),
         bodies_in_fleets(),
         imagining("imagining-develop", DEVELOP),
         imagining("imagining", CONFIRM),
