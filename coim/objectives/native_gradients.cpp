@@ -6,6 +6,8 @@
 
 #include "native_networks.h"
 
+#include <numeric>
+
 // ---- Eq. 7-8 of one policy and its critics.
 
 struct Sac {
@@ -245,9 +247,16 @@ struct Dynamics {
 namespace {
 
 template <class T>
-T softplus(T x) {
-  return x > 20 ? x : std::log1p(std::exp(x));  // as torch has it
+Vector<T> softplus(Vector<T> x) {
+  const Vector<T> size = x < T(0) ? -x : x;
+  return x > T(20) ? x : (x < T(0) ? Vector<T>{} : x) + log_of_one_and<T>(exponential<T>(-size));  // 20: as torch has it
 }
+
+// All entries of a block of rows, one after the other: mean and unbounded log-variance, then their gradients; the losses.
+template <class T>
+struct Moments {
+  T *mean, *raw, *loss;
+};
 
 template <class T>
 int64_t dynamics(const Dynamics& d) {
@@ -256,29 +265,43 @@ int64_t dynamics(const Dynamics& d) {
   const Packing<T> network = packing(room, d.layer, d.layers, true);
   const Weights<T> weights{d.batch, block, d.threads, d.team};
   const Trace<T> all = trace(room, weights.rows(), d.layer, d.layers, true, true);
+  const int64_t F = network.front().inputs, S = network.back().outputs / 2;
+  std::vector<Moments<T>> desks;
+  for (int64_t worker = 0; worker < std::max(int64_t(1), d.threads); ++worker) {
+    const int64_t entries = block * S + LANES<T>;
+    desks.push_back({room.numbers(entries), room.numbers(entries), room.numbers(entries)});
+  }
   T* losses = room.numbers(d.batch);
   if (d.scratch == nullptr) return room.used;
   spread(d.team, d.threads, network.size(), [&](int64_t task, int64_t) { network[task].pack(); });
 
-  const int64_t F = network.front().inputs, S = network.back().outputs / 2;
-  const T low = d.low, high = d.high;
-  spread(d.team, d.threads, blocks, [&](int64_t task, int64_t) {
+  const T low = d.low, high = d.high, share = T(1) / d.batch;
+  spread(d.team, d.threads, blocks, [&](int64_t task, int64_t worker) {
     const int64_t from = task * block, rows = std::min(block, d.batch - from);
     const Trace<T> mine = all.from(weights.place(from));
     for (int64_t i = 0; i < rows; ++i) std::copy_n(static_cast<const T*>(d.x) + (from + i) * F, F, mine.values[0].row(i));
     forward<T>(network, rows, mine);
+    const auto [mean, raw, loss] = desks[worker];
+    const T* target = static_cast<const T*>(d.target) + from * S;
     for (int64_t i = 0; i < rows; ++i) {
-      const T *mean = mine.values.back().row(i), *raw = mean + S, *target = static_cast<const T*>(d.target) + (from + i) * S;
-      T *of_mean = mine.deltas.back().row(i), *of_raw = of_mean + S, loss = 0;
-      for (int64_t e = 0; e < S; ++e) {  // `_output_gradient` of dynamics_gradients.py
-        const T below = high - softplus(high - raw[e]), log_var = low + softplus(below - low);
-        const T precision = std::exp(-log_var), error = mean[e] - target[e];
-        const T slope = 1 / (1 + std::exp(raw[e] - high)) * (1 / (1 + std::exp(low - below)));
-        of_mean[e] = 2 * error * precision / d.batch;
-        of_raw[e] = (1 - error * error * precision) * slope / d.batch;
-        loss += error * error * precision + log_var;
-      }
-      losses[from + i] = loss;
+      const T* out = mine.values.back().row(i);
+      copy_row<T>(mean + i * S, {{out, S}});
+      copy_row<T>(raw + i * S, {{out + S, S}});
+    }
+    for (int64_t at = 0; at < rows * S; at += LANES<T>) {  // `_output_gradient` of dynamics_gradients.py
+      Vector<T> wanted{};
+      std::memcpy(&wanted, target + at, std::min(LANES<T>, rows * S - at) * sizeof(T));
+      const Vector<T> above = high - load(raw + at), below = high - softplus<T>(above) - low;
+      const Vector<T> log_var = low + softplus<T>(below), precision = exponential<T>(-log_var);
+      const Vector<T> error = load(mean + at) - wanted, square = error * error * precision;
+      const Vector<T> slope = sigmoid<T>(above) * sigmoid<T>(below);  // of log_var over raw
+      store(mean + at, T(2) * share * error * precision);
+      store(raw + at, share * (T(1) - square) * slope);
+      store(loss + at, square + log_var);
+    }
+    for (int64_t i = 0; i < rows; ++i) {
+      copy_row<T>(mine.deltas.back().row(i), {{mean + i * S, S}, {raw + i * S, S}});
+      losses[from + i] = std::accumulate(loss + i * S, loss + (i + 1) * S, T(0));
     }
     backward<T>(network, rows, mine);
     weights.of_block(network, mine, from, rows);

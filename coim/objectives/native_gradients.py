@@ -33,9 +33,9 @@ SOURCE = Source(
     way_out="set compile=False",
 )
 NUMBERS = {torch.float32: "float", torch.float64: "double"}
-# Wider layers do not fit the cache, and the libraries' products pack them better. AMD EPYC with AVX2, one thread, in
-# multiples of torch.mm's time for the products, native and written out: SAC 3 x 64 0.93 and 2.8, 3 x 200 1.2 and 1.6; a
-# member of an ensemble 3 x 128 1.42 and 2.0, 3 x 256 1.39 and 1.5, 3 x 500 1.4 and 1.24.
+# AMD EPYC with AVX2, one thread, in multiples of torch.mm's time for the products, native and written out: SAC 3 x 64
+# 0.94 and 2.5, 3 x 200 1.03 and 1.5; a member of an ensemble 3 x 128 1.10 and 1.8, 3 x 256 1.08 and 1.4. Of 3 x 500
+# 1.17 and 1.25, but in an update of three members, whose weights no cache holds, no difference was left.
 UP_TO = 256
 
 
