@@ -268,7 +268,7 @@ int64_t dynamics(const Dynamics& d) {
   const int64_t F = network.front().inputs, S = network.back().outputs / 2;
   std::vector<Moments<T>> desks;
   for (int64_t worker = 0; worker < std::max(int64_t(1), d.threads); ++worker) {
-    const int64_t entries = block * S + LANES<T>;
+    const int64_t entries = block * S;
     desks.push_back({room.numbers(entries), room.numbers(entries), room.numbers(entries)});
   }
   T* losses = room.numbers(d.batch);

@@ -2,8 +2,9 @@
 
 `coim.objectives.gradients` and `coim.objectives.dynamics_gradients` say what is computed;
 ``tests/objectives/test_native_gradients.py`` holds the two equal. There every operation goes over the whole batch and
-writes its result to memory. Here a block of rows goes through all networks and back while it is in the cache, and all
-else but the products happens in the registers of a product. The result has the same bits with any number of threads.
+writes its result to memory. Here a block of rows goes through all networks and back while it is in the cache, and ReLU
+and what is multiplied on the way back happen in the registers of a product. The result has the same bits with any
+number of threads.
 
 Shapes: B batch, N critics, S observation, D design, A action, F input features.
 """
@@ -70,7 +71,8 @@ class NativeSAC:
 
     Raises:
         TypeError: if the networks are neither float32 nor float64.
-        ValueError: if a tensor has another shape or dtype, or is not contiguous on the CPU.
+        ValueError: if a tensor has another shape or dtype, or is not contiguous on the CPU; if rows, numbers in a layer
+            or threads are fewer than one.
         RuntimeError: if the code cannot be compiled.
     """
 
@@ -97,7 +99,7 @@ class NativeSAC:
         for other in (*critics, *targets):
             if (found := [tuple(weight.shape) for weight in other.weights]) != first:
                 raise ValueError(f"a critic has layers {found}, the first one {first}; give them the same ones")
-        _check_size(size)
+        _check_counts(size, threads)
         _check_gradients([policy, *critics], gradients)
         self._shapes = {
             "observation": (size, observed),
@@ -228,7 +230,7 @@ class NativeDynamics:
     ) -> None:
         weights = network.weights[0]
         (size, features), entries = x.shape, target.shape[-1]
-        _check_size(size)
+        _check_counts(size, threads)
         _check_network("ensemble", network, features, 2 * entries, weights)
         _check_gradients([network], gradients)
         check_tensor("x", x, (size, features), weights.dtype)
@@ -337,16 +339,23 @@ def _split(tensors: Sequence[Tensor], counts: Sequence[int]) -> list[Sequence[Te
     return [tensors[end - count : end] for count, end in zip(counts, ends)]
 
 
-def _check_size(size: int) -> None:
+def _check_counts(size: int, threads: int) -> None:
     if size < 1:
         raise ValueError("a batch has no rows; give at least one")
+    if threads < 1:
+        raise ValueError(f"threads is {threads}, it must be at least 1")
 
 
 def _check_network(name: str, network: Network, inputs: int, outputs: int, like: Tensor) -> None:
     sizes = [inputs, *(weight.shape[-1] for weight in network.weights)]
     if sizes[-1] != outputs:
         raise ValueError(f"the {name} returns {sizes[-1]} numbers, and {outputs} are wanted")
-    for weight, bias, rows, columns in zip(network.weights, network.biases, sizes[:-1], sizes[1:]):
+    if len(network.biases) != len(network.weights):
+        counts = f"{len(network.biases)} biases for {len(network.weights)} weights"
+        raise ValueError(f"{counts} of the {name}; give one for each")
+    if 0 in sizes:
+        raise ValueError(f"the {name} has layers of {sizes} numbers, and each must have at least one")
+    for weight, bias, rows, columns in zip(network.weights, network.biases, sizes, sizes[1:]):
         check_tensor(f"a weight of the {name}", weight, (rows, columns), like.dtype)
         check_tensor(f"a bias of the {name}", bias, (columns,), like.dtype)
 

@@ -26,7 +26,7 @@ constexpr int BYTES = 64, TILE_ROWS = 8;
 constexpr int BYTES = 32, TILE_ROWS = 6;
 #endif
 constexpr int64_t BLOCK = 132;  // about so many rows go through the networks together
-constexpr int64_t DEPTH = 128;  // products that a tile sums at once of what was not in panels; of panels twice as many
+constexpr int64_t DEPTH = 128;  // products that a tile sums at once of a copied panel; of others twice as many
 constexpr int64_t LINE = 64;    // bytes of a line of the cache
 
 template <class T>
@@ -48,13 +48,16 @@ void store(T* at, Vector<T> x) {
   *reinterpret_cast<Vector<T>*>(at) = x;
 }
 
-// e^x. In float by the polynomial of Cephes (netlib.org/cephes, expf), to two units in the last place; NaN stays NaN.
+// e^x. In float by the polynomial of Cephes (netlib.org/cephes, expf), to two units in the last place; 0 where torch has less
+// than a normal float; NaN stays NaN.
 template <class T>
-Vector<T> exponential(Vector<T> x) {
+Vector<T> exponential(Vector<T> given) {
+  Vector<T> x = given;
   if constexpr (std::is_same_v<T, float>) {
     typedef int32_t Whole __attribute__((vector_size(BYTES)));
-    x = x > 88.3762626647949f ? Vector<T>{} + 88.3762626647949f : x;
-    x = x < -87.3365447504f ? Vector<T>{} - 87.3365447504f : x;
+    constexpr float most = 88.3762626647949f, least = -87.3365447504f;
+    x = x > most ? Vector<T>{} + most : x;
+    x = x < least ? Vector<T>{} + least : x;
     const Vector<T> magic = Vector<T>{} + 12582912.0f;  // 1.5 * 2^23: adding it rounds to a whole number
     const Vector<T> n = (x * 1.44269504088896341f + magic) - magic;
     const Vector<T> r = (x - n * 0.693359375f) + n * 2.12194440e-4f;
@@ -65,7 +68,9 @@ Vector<T> exponential(Vector<T> x) {
     y = y * r + 5.0000001201e-1f;
     y = y * (r * r) + r + 1.0f;
     const Whole power = (__builtin_convertvector(n, Whole) + 127) << 23;
-    return y * reinterpret_cast<const Vector<T>&>(power);
+    y *= reinterpret_cast<const Vector<T>&>(power);
+    y = given < least ? Vector<T>{} : y;
+    return given > most ? Vector<T>{} + INFINITY : y;
   } else {
     for (int64_t i = 0; i < LANES<T>; ++i) x[i] = std::exp(x[i]);
     return x;
@@ -147,8 +152,8 @@ struct Product {
   int64_t rows, columns, depth;
   const T* a;
   int64_t row, column;  // A(i, k) lies at a[i * row + k * column]
-  const T* b;           // column j of B begins at b[j * panel], its rows are b_row apart; whole vectors can be read
-  int64_t panel, b_row;
+  const T* b;           // a panel that begins at column j lies at b[j * panel], its rows are b_row apart, whole vectors can be
+  int64_t panel, b_row; // read; in `tile` it is the one that is read
   Matrix<T> c;
   const T* bias = nullptr;  // what the sums begin with, if not with zero
   bool adds = false;    // or they begin with C
@@ -217,7 +222,8 @@ struct Product {
     if (end == End::SILU) through_silu(i, j, ROWS, VECTORS);
   }
 
-  // In place, once the sums stand in C: an exponential of each number is dear enough, so its slope is kept for the way back.
+  // In place, once the sums stand in C: beside an exponential of each number that costs little. The slope is kept for the way
+  // back, which needs no exponential then.
   void through_silu(int64_t i, int64_t j, int height, int vectors) const {
     for (int r = 0; r < height; ++r) {
       for (int v = 0; v < vectors; ++v) {
@@ -238,8 +244,9 @@ struct Product {
     for (; i < rows; ++i) tile<1, VECTORS>(i, j);
   }
 
-  // Sums of many products are taken in parts, whose right-hand sides fit the first cache beside the left ones. A panel of a
-  // right-hand side that lies in rows is copied first: so updates of 3 x 200 units took 3 to 5 % less.
+  // Sums of many products are taken in parts, whose right-hand sides stay in the first cache. A panel of a right-hand side that
+  // lies in longer rows is copied first: so updates of 3 x 200 units took 3 to 5 % less. One that is a single panel as it is
+  // needs no copy.
   void compute() const {
     const bool in_panels = b_row == PANEL<T>;
     const int64_t most = in_panels ? 2 * DEPTH : DEPTH;
@@ -331,7 +338,7 @@ struct Packed {
       const int64_t count = std::min(PANEL<T>, asked - from);
       T* to = backward + from * outputs;
       const T* rows = weight + (first + from) * outputs;
-      for (int64_t o = 0; o < outputs; o += LANES<T>, to += LANES<T> * PANEL<T>) {  // whole lines are read
+      for (int64_t o = 0; o < outputs; o += LANES<T>, to += LANES<T> * PANEL<T>) {  // whole vectors are read
         const int64_t columns = std::min(LANES<T>, outputs - o);
         for (int64_t f = 0; f < count; ++f) {
           for (int64_t i = 0; i < columns; ++i) to[i * PANEL<T> + f] = rows[f * outputs + o + i];

@@ -29,6 +29,9 @@ SIZES = [
     (7, 3, 2, 1, (5,), 1),
     (1, 1, 1, 1, (), 2),
 ]
+# Sizes of batch, inputs and outputs, hidden layers of a member; one with sums of more products than are taken at once.
+MEMBERS = [(256, 30, 34, (64, 64)), (300, 300, 6, (261,)), (100, 9, 10, (129,)), (3, 2, 2, ())]
+BOUNDS = (-10.0, 0.5)  # of its log-variance
 EXACT = {torch.float64: 1e-11, torch.float32: 2e-4}
 
 
@@ -85,19 +88,51 @@ def test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes: tuple, dt
     torch.testing.assert_close(losses, right, rtol=EXACT[dtype], atol=EXACT[dtype])
 
 
+class Member:
+    """A member of an ensemble and rows of some sizes."""
+
+    def __init__(self, sizes: tuple, dtype: torch.dtype = torch.float64) -> None:
+        size, features, outputs, cells = sizes
+        rng = torch.Generator().manual_seed(0)
+        self.network = network(rng, features, *cells, outputs, dtype=dtype)
+        self.x, self.target = (torch.randn(size, n, generator=rng, dtype=dtype) for n in (features, outputs // 2))
+
+    def expected(self) -> list[Tensor]:
+        """Gradients, and the loss."""
+        found = dynamics_gradients(self.network, self.x, self.target, log_var_range=BOUNDS)
+        return [*found.parameters, found.loss.reshape(1)]
+
+    def found(self, *, threads: int = 1) -> list[Tensor]:
+        gradients, rows = unwritten(self.network), (self.x, self.target)
+        native = NativeDynamics(self.network, gradients, *rows, log_var_range=BOUNDS, threads=threads)
+        return [*gradients, native(*rows)]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("dtype", EXACT)
-@pytest.mark.parametrize("sizes", [(256, 30, 34, (64, 64)), (100, 9, 10, (129,)), (3, 2, 2, ())], ids=str)
-def test_gradients_and_loss_of_a_member_equal_the_written_out_ones(sizes: tuple, dtype: torch.dtype) -> None:
-    size, features, outputs, cells = sizes
-    rng = torch.Generator().manual_seed(0)
-    member = network(rng, features, *cells, outputs, dtype=dtype)
-    x, target = (torch.randn(size, n, generator=rng, dtype=dtype) for n in (features, outputs // 2))
-    expected = dynamics_gradients(member, x, target, log_var_range=(-10.0, 0.5))
-    gradients = unwritten(member)
-    loss = NativeDynamics(member, gradients, x, target, log_var_range=(-10.0, 0.5), threads=2)(x, target)
-    for own, other in zip(gradients, expected.parameters, strict=True):
+@pytest.mark.parametrize("sizes", MEMBERS, ids=str)
+def test_gradients_and_loss_of_a_member_equal_the_written_out_ones(
+    sizes: tuple, dtype: torch.dtype, threads: int
+) -> None:
+    member = Member(sizes, dtype)
+    for own, other in zip(member.found(threads=threads), member.expected(), strict=True):
         torch.testing.assert_close(own, other, rtol=EXACT[dtype], atol=EXACT[dtype])
-    torch.testing.assert_close(loss[0], expected.loss, rtol=EXACT[dtype], atol=EXACT[dtype])
+
+
+@pytest.mark.parametrize("number", [-1e30, -200.0, -90.0, -20.0, 20.0, 90.0, 200.0, 1e30, -torch.inf, torch.inf])
+@pytest.mark.parametrize("of", ["a sum before SiLU", "a log-variance", "an error"])
+def test_numbers_far_outside_give_what_they_give_written_out(of: str, number: float) -> None:
+    """Where an exponential is zero or infinite, and what follows from it."""
+    member = Member(MEMBERS[2], torch.float32)
+    if of == "an error":
+        member.target[0, 0] = number
+    else:
+        member.network.biases[0 if of == "a sum before SiLU" else 1][-1] = number
+    for own, other in zip(member.found(), member.expected(), strict=True):
+        largest = float(
+            other.nan_to_num(0, 0, 0).abs().amax().clamp(min=1)
+        )  # the roundings of a sum go by its summands
+        torch.testing.assert_close(own, other, rtol=2e-4, atol=2e-4 * largest, equal_nan=True)
 
 
 def test_critics_that_say_the_same_share_the_gradient_of_the_policy() -> None:
@@ -113,6 +148,10 @@ def test_any_number_of_threads_computes_the_same_bits(threads: int) -> None:
     one, several = case.found(), case.found(threads=threads)
     for own, other in zip([*one[0], one[1]], [*several[0], several[1]]):
         assert torch.equal(own, other)
+    member = Member(MEMBERS[1], torch.float32)
+    right = member.found()
+    for _ in range(20):  # what one thread writes over another's is seen now and then
+        assert all(map(torch.equal, member.found(threads=threads), right))
 
 
 def test_torch_lends_its_threads() -> None:
@@ -133,6 +172,16 @@ def test_a_number_that_is_not_finite_is_not_lost(where: str) -> None:
     assert losses.isnan().tolist() == right.isnan().tolist()
     for own, other in zip(gradients, [*expected.policy, *chain(*expected.critics)]):
         assert torch.equal(own.isnan(), other.isnan())
+
+
+@pytest.mark.parametrize("where", ["x", "target", "weight"])
+def test_nor_is_one_in_a_member(where: str) -> None:
+    member = Member(MEMBERS[0], torch.float32)
+    broken = member.network.weights[1] if where == "weight" else getattr(member, where)
+    broken[0] = torch.nan
+    found, expected = member.found(), member.expected()
+    assert any(part.isnan().any() for part in expected)
+    assert all(torch.equal(own.isnan(), other.isnan()) for own, other in zip(found, expected, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -168,6 +217,16 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
         case.found()
     with pytest.raises(ValueError, match="a batch has no rows"):
         Case((0, *SIZES[0][1:])).found()
+    with pytest.raises(ValueError, match="threads is 0, it must be at least 1"):
+        Case(SIZES[3]).found(threads=0)
+    with pytest.raises(
+        ValueError, match=r"the policy has layers of \[6, 0, 8\] numbers, and each must have at least one"
+    ):
+        Case((33, 5, 1, 4, (0,), 1)).found()
+    case = Case(SIZES[3])
+    case.policy = case.policy._replace(biases=case.policy.biases[:1])
+    with pytest.raises(ValueError, match="1 biases for 2 weights of the policy; give one for each"):
+        case.found()
     case = Case(SIZES[3], torch.bfloat16)
     with pytest.raises(TypeError, match=r"native gradients are of float32 or float64, not of torch.bfloat16; set"):
         case.found()
@@ -190,6 +249,9 @@ def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeyp
     monkeypatch.setattr(native_gradients, "library", lambda: library)
     for sizes in SIZES:
         test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes, torch.float32)
+    for sizes in MEMBERS:
+        for dtype in EXACT:
+            test_gradients_and_loss_of_a_member_equal_the_written_out_ones(sizes, dtype, threads=2)
 
 
 def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
