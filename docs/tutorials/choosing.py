@@ -83,6 +83,6 @@ print([round(xi, 2) for xi in design.tolist()], f"{mean.item():.0f} +- {deviatio
 # In a run
 # --------
 #
-# ``coim run hopper --method grounded`` chooses bodies by the posterior, with a critic that is checked against what
-# was earned. `PosteriorChoice` is the part of Algorithm 1 that does so. A search of your own is a class with one
-# method: see ``recipes/new_search.py``.
+# ``coim run hopper --method returns`` chooses bodies by the posterior, ``--method grounded`` with a critic as its mean
+# that is checked against what was earned. `PosteriorChoice` is the part of Algorithm 1 that does so. A search of your
+# own is a class with one method: see ``recipes/new_search.py``.

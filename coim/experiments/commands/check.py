@@ -26,7 +26,7 @@ OPTIONAL = {
     "scipy": ("no intervals in figures and tables", "'coim[experiments]'"),
     "imageio-ffmpeg": ("no films", "'coim[experiments]'"),
     "ray": ("no studies", "'coim[experiments]'"),
-    "botorch": ("no --method grounded, no DesignPosterior", "'coim[posterior]'"),
+    "botorch": ("no --method returns or grounded, no DesignPosterior", "'coim[posterior]'"),
     "wandb": ("--log wandb has nothing to log with", "'coim[experiments]'"),
     "tensorboard": ("--log tensorboard has nothing to log with", "'coim[tensorboard]'"),
     "trackio": ("--log trackio has nothing to log with", "trackio"),

@@ -23,10 +23,10 @@ from coim.run_folder import RENAMED
 class Written(Settings):
     """Settings as they are written on a command line: not validated, so that an error can name the option."""
 
-    method: Literal["paper", "grounded"] | None = None
-    """Way to choose the next body. paper: maximise Eq. 5 as printed. grounded: a Gaussian process over the returns
-    earned so far, with Eq. 5 over visited states as its mean, at first near the best body and then further away. By
-    default that of the preset: grounded in quick."""
+    method: Literal["paper", "grounded", "returns"] | None = None
+    """Way to choose the next body. paper: maximise Eq. 5 as printed. returns: Bayesian optimisation, a Gaussian process
+    over the returns earned so far. grounded: that with Eq. 5 over visited states as its mean, at first near the best
+    body and then further away. By default that of the preset: returns in quick."""
 
     def __post_init__(self) -> None:
         pass

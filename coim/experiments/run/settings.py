@@ -196,15 +196,17 @@ METHODS: dict[str, dict[str, Any]] = {
         "chosen_by": "posterior",
         "value_states": "matched",
         "value_over": "visited",
-        # The first bodies that were chosen from the whole space earned a third of what random ones did (432, 1,214).
+        # On three seeds the first bodies that were chosen from the whole space earned a third of what random ones did.
         "reach": 0.25,
         "widening": 0.1,
     },
+    # On ten further seeds its bodies earned 238 more than those of grounded (138 to 337).
+    "returns": {"chosen_by": "returns", "value_states": "stored", "value_over": "start", "reach": None, "widening": 0.0},
 }
 
 QUICK = Settings(
     preset="quick",
-    **METHODS["grounded"],
+    **METHODS["returns"],
     num_designs=8,
     first_episodes=6,
     episodes=6,

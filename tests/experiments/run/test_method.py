@@ -20,14 +20,16 @@ def test_a_method_moves_defaults_and_options_win_over_it(method: str) -> None:
     assert parse("prog", "", ["--method", method, "--value-over", "start"]).value_over == "start"
 
 
-def test_the_papers_method_is_the_default_of_its_protocol_and_grounded_that_of_a_first_look() -> None:
+def test_the_papers_method_is_the_default_of_its_protocol_and_returns_that_of_a_first_look() -> None:
     assert parse("prog", "", []) == parse("prog", "", ["--method", "paper"])
-    assert parse("prog", "", ["--preset", "quick"]) == parse("prog", "", ["--preset", "quick", "--method", "grounded"])
+    assert parse("prog", "", ["--preset", "quick"]) == parse("prog", "", ["--preset", "quick", "--method", "returns"])
     assert parse("prog", "", ["--preset", "quick", "--method", "paper"]).chosen_by == "value"
 
 
-def test_an_arm_of_its_name_has_its_settings() -> None:
-    assert ARMS["grounded"].settings == {"imagine": "none"} | METHODS["grounded"]
+@pytest.mark.parametrize("method", ["grounded", "returns"])
+def test_an_arm_of_its_name_has_its_settings(method: str) -> None:
+    given = {"imagine": "none"} | METHODS[method]
+    assert dataclasses.replace(Settings(), **ARMS[method].settings) == dataclasses.replace(Settings(), **given)
 
 
 @pytest.mark.parametrize(
