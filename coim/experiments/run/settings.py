@@ -201,7 +201,13 @@ METHODS: dict[str, dict[str, Any]] = {
         "widening": 0.1,
     },
     # On ten further seeds its bodies earned 238 more than those of grounded (138 to 337).
-    "returns": {"chosen_by": "returns", "value_states": "stored", "value_over": "start", "reach": None, "widening": 0.0},
+    "returns": {
+        "chosen_by": "returns",
+        "value_states": "stored",
+        "value_over": "start",
+        "reach": None,
+        "widening": 0.0,
+    },
 }
 
 QUICK = Settings(
