@@ -129,9 +129,8 @@ def test_numbers_far_outside_give_what_they_give_written_out(of: str, number: fl
     else:
         member.network.biases[0 if of == "a sum before SiLU" else 1][-1] = number
     for own, other in zip(member.found(), member.expected(), strict=True):
-        largest = float(
-            other.nan_to_num(0, 0, 0).abs().amax().clamp(min=1)
-        )  # the roundings of a sum go by its summands
+        # The roundings of a sum go by its summands.
+        largest = float(other.nan_to_num(0, 0, 0).abs().amax().clamp(min=1))
         torch.testing.assert_close(own, other, rtol=2e-4, atol=2e-4 * largest, equal_nan=True)
 
 
@@ -219,9 +218,7 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
         Case((0, *SIZES[0][1:])).found()
     with pytest.raises(ValueError, match="threads is 0, it must be at least 1"):
         Case(SIZES[3]).found(threads=0)
-    with pytest.raises(
-        ValueError, match=r"the policy has layers of \[6, 0, 8\] numbers, and each must have at least one"
-    ):
+    with pytest.raises(ValueError, match=r"the policy has layers of \[6, 0, 8\] numbers, and each must have at least"):
         Case((33, 5, 1, 4, (0,), 1)).found()
     case = Case(SIZES[3])
     case.policy = case.policy._replace(biases=case.policy.biases[:1])
