@@ -263,9 +263,9 @@ struct Product {
         part.b = b + from * b_row + j * panel;
         if (!in_panels) {
           for (int64_t k = 0; k < part.depth; ++k) {
-            const T* row = part.b + k * b_row;
-            store(copied + k * PANEL<T>, load(row));
-            if (whole) store(copied + k * PANEL<T> + LANES<T>, load(row + LANES<T>));
+            const T* right = part.b + k * b_row;
+            store(copied + k * PANEL<T>, load(right));
+            if (whole) store(copied + k * PANEL<T> + LANES<T>, load(right + LANES<T>));
           }
           part.b = copied;
         }
