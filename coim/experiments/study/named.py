@@ -6,7 +6,8 @@ from coim.experiments.study.definition import Block, Study
 
 SEEDS = tuple(range(10))
 # A method is developed on the first seeds and confirmed on the others, by which nothing may be chosen.
-DEVELOP, CONFIRM, FLEET, REACH = tuple(range(5)), tuple(range(20, 30)), tuple(range(30, 40)), tuple(range(40, 50))
+DEVELOP, CONFIRM, FLEET = tuple(range(5)), tuple(range(20, 30)), tuple(range(30, 40))
+REACH, OTHERS = tuple(range(40, 50)), tuple(range(50, 60))
 
 
 def bodies(name: str, seeds: tuple[int, ...]) -> Study:
@@ -19,6 +20,12 @@ def bodies_with_and_without_reach() -> Study:
     """Whether it pays to search near the best body at first, as `grounded` does and the others do not."""
     arms = ("grounded", "posterior", "returns", "random-bodies")
     return Study(name="bodies-reach", environments=("hopper",), arms=arms, seeds=REACH, protocol="pilot")
+
+
+def bodies_of_other_robots() -> Study:
+    """Whether `returns`, which was found on the hopper, gains on robots that it was not made with."""
+    robots, arms = ("walker", "half_cheetah"), ("returns", "random-bodies")
+    return Study(name="bodies-others", environments=robots, arms=arms, seeds=OTHERS, protocol="pilot")
 
 
 def bodies_in_fleets() -> Study:
@@ -78,6 +85,7 @@ STUDIES = {
         bodies("bodies-develop", DEVELOP),
         bodies("bodies", CONFIRM),
         bodies_with_and_without_reach(),
+        bodies_of_other_robots(),
         bodies_in_fleets(),
         imagining("imagining-develop", DEVELOP),
         imagining("imagining", CONFIRM),
