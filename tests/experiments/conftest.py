@@ -16,7 +16,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
     For tests of what stands in tables and in words beside them.
     """
-    from coim.experiments.report import page
+    from coim.experiments.figures import write
+    from coim.experiments.report import page, summary_png
 
     blank = page.svg(Figure(figsize=(7, 3)))
 
@@ -25,6 +26,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Figure, "savefig", touch)
     monkeypatch.setattr(page, "svg", lambda figure: blank)
+    for module in (write, summary_png):
+        monkeypatch.setattr(module, "lay_out", lambda figure: figure)
 
 
 @pytest.fixture(scope="session")

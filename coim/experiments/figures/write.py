@@ -10,7 +10,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 
-from coim.experiments.drawing.layout import FONT
+from coim.experiments.drawing.layout import FONT, lay_out
 from coim.experiments.figures import (
     best_returns,
     cartpole,
@@ -95,6 +95,7 @@ def write_plot(folder: Path, plot: Plot) -> None:
     remove(folder, plot.name)
     if plot.figure is None:
         return
+    lay_out(plot.figure)
     with written_aside(files["png"]) as aside:
         plot.figure.savefig(aside, dpi=RESOLUTION)
     with written_aside(files["pdf"]) as aside:

@@ -16,7 +16,7 @@ import matplotlib as mpl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from coim.experiments.drawing.layout import FONT
+from coim.experiments.drawing.layout import FONT, lay_out
 
 PIXELS = 96  # of an inch
 RESOLUTION = 200  # of what is drawn as pixels inside of a figure, per inch
@@ -84,7 +84,7 @@ def svg(figure: Figure) -> Svg:
     """A figure drawn as SVG; its text is outlines, so that every browser shows the same."""
     drawn = io.BytesIO()
     with mpl.rc_context(FONT):
-        figure.savefig(drawn, format="svg", dpi=RESOLUTION, metadata={"Date": None})
+        lay_out(figure).savefig(drawn, format="svg", dpi=RESOLUTION, metadata={"Date": None})
     width, height = (round(inches * PIXELS) for inches in figure.get_size_inches())
     return Svg(base64.b64encode(drawn.getvalue()).decode(), width, height)
 

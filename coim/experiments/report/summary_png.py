@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from coim.envs import MorphEnv
 from coim.experiments.drawing.bodies import draw_bodies
+from coim.experiments.drawing.layout import lay_out
 from coim.experiments.report.axes import cross_handles, explain, plot_over_designs
 from coim.experiments.run.atomic_write import written_aside
 from coim.experiments.run.records import read_record
@@ -48,5 +49,5 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure and free it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(path) as aside:
-        figure.savefig(aside, dpi=150)
+        lay_out(figure).savefig(aside, dpi=150)
     plt.close(figure)
