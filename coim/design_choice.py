@@ -43,6 +43,16 @@ class Situation:
         tried: designs whose episodes are over, in the order of building, each with its kind and its best return
             ``[K]``. A run that was begun before they were kept lacks its earlier ones.
         diverged: runs that have diverged, and where. They need no new body.
+
+    Example:
+        A choice that explores around each run's best body so far, where Algorithm 1 draws one from all:
+
+        >>> class NearTheBest(DesignChoice):
+        ...     def explore(self, situation: Situation) -> Tensor:
+        ...         returns = torch.stack([done.best_return for done in situation.tried])  # [N, K]
+        ...         designs = torch.stack([done.design for done in situation.tried])  # [N, K, D]
+        ...         best = designs[returns.nan_to_num(nan=-torch.inf).argmax(0), torch.arange(situation.num_runs)]
+        ...         return self.spec.project(best + 0.1 * torch.randn(best.shape, generator=self.rng))
     """
 
     index: int

@@ -29,6 +29,12 @@ class DesignChosen:
             have, and their numbers here and in all later events are NaN.
         expected: best return that is expected of this design, ``[K]``; None where a choice expects none.
         deviation: of the best return around ``expected``, noise of a run included, ``[K]``.
+
+    Example:
+        >>> import torch
+        >>> event = DesignChosen(5, "optimised", torch.ones(2, 4), predicted=torch.tensor([31.5, 30.25]))
+        >>> event.index, event.kind, event.predicted.tolist(), event.expected is None
+        (5, 'optimised', [31.5, 30.25], True)
     """
 
     index: int
@@ -59,6 +65,17 @@ class EpisodeDone:
         seconds: wall-clock by part; parts that run side by side overlap, ``episode`` is the whole.
         diverged: runs that have diverged, and where. One that diverges in this very episode has its losses in
             ``metrics`` as they came out, and is evaluated with the weights that it had before.
+
+    Example:
+        To watch `CoAdaptation` learn, episode by episode:
+
+        >>> import torch
+        >>> def told(event: Event) -> None:
+        ...     if isinstance(event, EpisodeDone):
+        ...         print(event.index, event.episode, event.evaluation_return.tolist())
+        >>> earned = torch.tensor([120.0, 80.0])
+        >>> told(EpisodeDone(0, "first", 3, torch.ones(2, 4), 0.5 * earned, earned, 4000, 0, {}, {"episode": 4.1}))
+        0 3 [120.0, 80.0]
     """
 
     index: int
@@ -84,6 +101,12 @@ class DesignDone:
         design: ``[K, D]``.
         best_return: highest evaluation return, ``[K]``: the figure of merit of the paper's Fig. 1.
         diverged: runs that have diverged, and where; on this design, ``best_return`` is the highest until then.
+
+    Example:
+        >>> import torch
+        >>> done = DesignDone(5, "optimised", torch.ones(2, 4), best_return=torch.tensor([910.0, 1240.0]))
+        >>> int(done.best_return.argmax())  # the run whose body earned most
+        1
     """
 
     index: int

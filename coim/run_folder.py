@@ -70,6 +70,11 @@ class TriedDesign:
         best_return: highest evaluation return.
         diverged: where the run diverged on this design, as ``design 2, episode 1``, and ``best_return`` is the highest
             until then; empty where it did not.
+
+    Example:
+        >>> tried = TriedDesign(0, 6, "optimised", torch.tensor([1.2, 0.8, 1.9, 0.6]), 31.5, best_return=910.0)
+        >>> tried.number, tried.best_return, bool(tried.diverged)
+        (6, 910.0, False)
     """
 
     run: int

@@ -33,6 +33,13 @@ class Agent:
     Attributes:
         policy: ``pi(a | s, xi)``.
         qvalue: the critics ``Q(s, a, xi)``.
+
+    Example:
+        >>> from coim import HopperMorph, make_policy, make_qvalue
+        >>> env = HopperMorph(num_runs=3, seed=0)
+        >>> agent = Agent(make_policy(env), make_qvalue(env))
+        >>> agent.qvalue(agent.policy(env.reset()))["state_action_value"].shape  # of three rows, by both critics
+        torch.Size([3, 2])
     """
 
     policy: Policy
@@ -46,6 +53,14 @@ class TrainedBody:
     Attributes:
         tried: the design ``[D]``, its number, and the return of that evaluation.
         policy: the individual policy that earned it, of one run.
+
+    Example:
+        >>> from coim import HopperMorph, make_policy
+        >>> bodies = HopperMorph(seed=0, episode_steps=10)
+        >>> tried = TriedDesign(0, 6, "optimised", torch.tensor([1.2, 0.8, 1.9, 0.6]), 31.5, best_return=910.0)
+        >>> body = TrainedBody(tried, make_policy(bodies))
+        >>> run_episode(bodies, body.policy, design=body.tried.design[None], deterministic=True).shape
+        torch.Size([10, 1])
     """
 
     tried: TriedDesign
@@ -67,6 +82,12 @@ class SavedRun:
         ensemble: p~; None in a run without one.
         designs: those whose episodes are all over, a row per run and design.
         run: the one that everything else is of; None where all K runs are stacked along the run axis.
+
+    Example:
+        >>> saved = load_run("runs/hopper-20260101-120000-run", run=0)  # doctest: +SKIP
+        >>> saved.settings["chosen_by"], [tried.best_return for tried in saved.designs]  # doctest: +SKIP
+        >>> best = saved.best.tried.design[None]  # doctest: +SKIP
+        >>> rows = run_episode(saved.bodies, saved.population.policy, design=best)  # doctest: +SKIP
     """
 
     folder: Path

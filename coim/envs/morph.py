@@ -74,6 +74,14 @@ class MorphEnv(Fleet, DesignedEnv):
         ValueError: if an argument is out of range, the device does not exist, the names or bounds of the design or the
             scale of the observation do not fit, the body is none that `coim.envs.root` knows, or the reward is not
             ``[*B, 1]``.
+
+    Example:
+        >>> from coim import HopperMorph
+        >>> bodies = HopperMorph(num_runs=2, seed=0)
+        >>> longer = torch.tensor([[1.0, 1.0, 1.0, 1.0], [1.0, 1.5, 1.5, 1.0]])  # torso, thigh, shank, foot
+        >>> rows = bodies.reset(TensorDict({"design": longer}, [2]))
+        >>> bool(rows["observation"][1, 0] > rows["observation"][0, 0])  # its torso stands higher, in m
+        True
     """
 
     def __init__(
