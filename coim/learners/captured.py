@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import optimizer
 
-from coim.objectives.native_gradients import AdamStep, check_tensor
+from coim.objectives.native_structures import AdamStep, check_tensor
 
 # One graph repeats so many updates: launched one by one, small networks wait for Python between them.
 PER_GRAPH = 50

@@ -14,15 +14,25 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Sequence
-from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from coim.native import Source, team
 from coim.objectives.gradients import Batch, Network
+from coim.objectives.native_structures import (
+    NUMBERS,
+    AdamStep,
+    Call,
+    Dynamics,
+    Sac,
+    check_counts,
+    check_gradients,
+    check_network,
+    check_tensor,
+    layers_of,
+)
 
 SOURCE = Source(
     path=Path(__file__).with_suffix(".cpp"),
@@ -33,7 +43,6 @@ SOURCE = Source(
     purpose="native gradients",
     way_out="set compile=False",
 )
-NUMBERS = {torch.float32: "float", torch.float64: "double"}
 # AMD EPYC with AVX2, one thread, in multiples of torch.mm's time for the products, native and written out: SAC 3 x 64
 # 0.94 and 2.5, 3 x 200 1.03 and 1.5; a member of an ensemble 3 x 128 1.10 and 1.8, 3 x 256 1.08 and 1.4. Of 3 x 500
 # 1.17 and 1.25, but in an update of three members, whose weights no cache holds, no difference was left.
@@ -90,17 +99,17 @@ class NativeSAC:
         weights = policy.weights[0]
         size, observed = batch.observation.shape
         designed, acted = batch.design.shape[-1], batch.action.shape[-1]
-        _check_network("policy", policy, observed + designed, 2 * acted, weights)
+        check_network("policy", policy, observed + designed, 2 * acted, weights)
         for critic in (*critics, *targets):
-            _check_network("critic", critic, observed + acted + designed, 1, weights)
+            check_network("critic", critic, observed + acted + designed, 1, weights)
         if len(targets) != len(critics):
             raise ValueError(f"{len(targets)} targets for {len(critics)} critics; give one for each")
         first = [tuple(weight.shape) for weight in critics[0].weights]
         for other in (*critics, *targets):
             if (found := [tuple(weight.shape) for weight in other.weights]) != first:
                 raise ValueError(f"a critic has layers {found}, the first one {first}; give them the same ones")
-        _check_counts(size, threads)
-        _check_gradients([policy, *critics], gradients)
+        check_counts(size, threads)
+        check_gradients([policy, *critics], gradients)
         self._shapes = {
             "observation": (size, observed),
             "design": (size, designed),
@@ -116,10 +125,11 @@ class NativeSAC:
         self.check(batch)
         split = [len(policy.weights) * 2, *(len(critic.weights) * 2 for critic in critics)]
         own, *of_critics = (list(part) for part in _split(gradients, split))
-        self._call = _Call(
+        self._call = Call(
+            library(),
             "sac",
             weights,
-            _Sac(
+            Sac(
                 team=team() if threads > 1 else None,
                 threads=threads,
                 batch=size,
@@ -129,9 +139,9 @@ class NativeSAC:
                 critics=len(critics),
                 policy_layers=len(policy.weights),
                 critic_layers=len(critics[0].weights),
-                policy=_layers([policy], [own]),
-                critic=_layers(critics, of_critics),
-                target=_layers(targets, [None] * len(targets)),
+                policy=layers_of([policy], [own]),
+                critic=layers_of(critics, of_critics),
+                target=layers_of(targets, [None] * len(targets)),
                 least=log_scale_range[0],
                 most=log_scale_range[1],
             ),
@@ -177,7 +187,7 @@ def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, al
         ValueError: if rows have another shape or dtype, or are not contiguous.
     """
     runs[0].check(rows, len(rows.reward), len(runs))
-    structs = (_Sac * len(runs))(*(run._call.struct for run in runs))
+    structs = (Sac * len(runs))(*(run._call.struct for run in runs))
     losses = rows.reward.new_empty(len(rows.reward), len(runs), 3)
     for k, struct in enumerate(structs):
         for name, part in zip(Batch._fields, rows):
@@ -186,17 +196,6 @@ def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, al
     function = getattr(library(), f"sac_updates_{NUMBERS[losses.dtype]}")
     function(structs, ctypes.c_int64(len(runs)), ctypes.c_int64(len(losses)), ctypes.byref(step))
     return losses
-
-
-class AdamStep(ctypes.Structure):
-    """Adam over flat buffers, and targets that follow the last weights; as ``Adam`` in the source."""
-
-    _fields_: ClassVar[Any] = (
-        [(name, ctypes.c_void_p) for name in ("weights", "gradient", "first", "second", "targets")]
-        + [(name, ctypes.c_int64) for name in ("count", "followed")]
-        + [(name, ctypes.c_double) for name in ("lr", "beta1", "beta2", "eps", "decay", "tau")]
-        + [("decoupled", ctypes.c_bool), ("steps", ctypes.c_double)]
-    )
 
 
 class NativeDynamics:
@@ -230,20 +229,21 @@ class NativeDynamics:
     ) -> None:
         weights = network.weights[0]
         (size, features), entries = x.shape, target.shape[-1]
-        _check_counts(size, threads)
-        _check_network("ensemble", network, features, 2 * entries, weights)
-        _check_gradients([network], gradients)
+        check_counts(size, threads)
+        check_network("ensemble", network, features, 2 * entries, weights)
+        check_gradients([network], gradients)
         check_tensor("x", x, (size, features), weights.dtype)
         check_tensor("target", target, (size, entries), weights.dtype)
-        self._call = _Call(
+        self._call = Call(
+            library(),
             "dynamics",
             weights,
-            _Dynamics(
+            Dynamics(
                 team=team() if threads > 1 else None,
                 threads=threads,
                 batch=size,
                 layers=len(network.weights),
-                layer=_layers([network], [list(gradients)]),
+                layer=layers_of([network], [list(gradients)]),
                 low=log_var_range[0],
                 high=log_var_range[1],
             ),
@@ -263,118 +263,6 @@ class NativeDynamics:
         return loss
 
 
-class _Layer(ctypes.Structure):
-    """As in ``native_networks.h``; the next two as in the source. There the fields are explained."""
-
-    _fields_ = [(name, ctypes.c_void_p) for name in ("weight", "bias", "weight_gradient", "bias_gradient")] + [
-        (name, ctypes.c_int64) for name in ("inputs", "outputs")
-    ]
-
-
-_Layers = ctypes.POINTER(_Layer)
-
-
-class _Sac(ctypes.Structure):
-    _fields_: ClassVar[Any] = (
-        [("team", ctypes.c_void_p), ("threads", ctypes.c_int64)]
-        + [(name, ctypes.c_int64) for name in ("batch", "observed", "designed", "acted")]
-        + [(name, ctypes.c_int64) for name in ("critics", "policy_layers", "critic_layers")]
-        + [(name, _Layers) for name in ("policy", "critic", "target")]
-        + [(name, ctypes.c_void_p) for name in Batch._fields]
-        + [(name, ctypes.c_double) for name in ("alpha", "gamma", "least", "most")]
-        + [(name, ctypes.c_void_p) for name in ("losses", "scratch")]
-    )
-
-
-class _Dynamics(ctypes.Structure):
-    _fields_: ClassVar[Any] = (
-        [("team", ctypes.c_void_p), ("threads", ctypes.c_int64)]
-        + [(name, ctypes.c_int64) for name in ("batch", "layers")]
-        + [(name, _Layers) for name in ("layer",)]
-        + [(name, ctypes.c_void_p) for name in ("x", "target")]
-        + [(name, ctypes.c_double) for name in ("low", "high")]
-        + [(name, ctypes.c_void_p) for name in ("loss", "scratch")]
-    )
-
-
-class _Call:
-    """One of the functions of the library, with its structure and the memory that it computes in."""
-
-    def __init__(self, name: str, weights: Tensor, struct: _Sac | _Dynamics) -> None:
-        if weights.dtype not in NUMBERS:
-            raise TypeError(f"native gradients are of float32 or float64, not of {weights.dtype}; set compile=False")
-        function = getattr(library(), f"{name}_{NUMBERS[weights.dtype]}")
-        function.restype = ctypes.c_int64
-        self.struct: Any = struct
-        self._function, self._at, self._like = function, ctypes.byref(struct), weights
-        line = 64 // weights.element_size()  # of the processor's cache, where the memory begins
-        self._scratch = weights.new_zeros(function(self._at) + line)
-        struct.scratch = (self._scratch.data_ptr() + 63) // 64 * 64
-
-    def __call__(self) -> None:
-        self._function(self._at)
-
-    def result(self, numbers: int) -> Tensor:
-        return self._like.new_empty(numbers)
-
-
-def _layers(networks: Sequence[Network], gradients: Sequence[Sequence[Tensor] | None]) -> ctypes.Array[_Layer]:
-    found = [
-        _Layer(
-            weight=weight.data_ptr(),
-            bias=bias.data_ptr(),
-            weight_gradient=None if own is None else own[2 * at].data_ptr(),
-            bias_gradient=None if own is None else own[2 * at + 1].data_ptr(),
-            inputs=weight.shape[0],
-            outputs=weight.shape[1],
-        )
-        for network, own in zip(networks, gradients, strict=True)
-        for at, (weight, bias) in enumerate(zip(network.weights, network.biases))
-    ]
-    return (_Layer * len(found))(*found)
-
-
 def _split(tensors: Sequence[Tensor], counts: Sequence[int]) -> list[Sequence[Tensor]]:
     ends = [sum(counts[: at + 1]) for at in range(len(counts))]
     return [tensors[end - count : end] for count, end in zip(counts, ends)]
-
-
-def _check_counts(size: int, threads: int) -> None:
-    if size < 1:
-        raise ValueError("a batch has no rows; give at least one")
-    if threads < 1:
-        raise ValueError(f"threads is {threads}, it must be at least 1")
-
-
-def _check_network(name: str, network: Network, inputs: int, outputs: int, like: Tensor) -> None:
-    sizes = [inputs, *(weight.shape[-1] for weight in network.weights)]
-    if sizes[-1] != outputs:
-        raise ValueError(f"the {name} returns {sizes[-1]} numbers, and {outputs} are wanted")
-    if len(network.biases) != len(network.weights):
-        counts = f"{len(network.biases)} biases for {len(network.weights)} weights"
-        raise ValueError(f"{counts} of the {name}; give one for each")
-    if 0 in sizes:
-        raise ValueError(f"the {name} has layers of {sizes} numbers, and each must have at least one")
-    for weight, bias, rows, columns in zip(network.weights, network.biases, sizes, sizes[1:]):
-        check_tensor(f"a weight of the {name}", weight, (rows, columns), like.dtype)
-        check_tensor(f"a bias of the {name}", bias, (columns,), like.dtype)
-
-
-def _check_gradients(networks: Sequence[Network], gradients: Sequence[Tensor]) -> None:
-    wanted = [part for network in networks for part in chain(*zip(network.weights, network.biases))]
-    if len(gradients) != len(wanted):
-        raise ValueError(f"{len(gradients)} gradients for {len(wanted)} weights and biases; give one for each")
-    for part, gradient in zip(wanted, gradients):
-        check_tensor("a gradient", gradient, tuple(part.shape), part.dtype)
-
-
-def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    """Refuse a tensor that native code would read as another one.
-
-    Raises:
-        ValueError: if its shape or dtype differ, or it is not contiguous on the CPU.
-    """
-    if tuple(tensor.shape) != shape or tensor.dtype != dtype:
-        raise ValueError(f"{name} is {tuple(tensor.shape)} of {tensor.dtype}, and {shape} of {dtype} is wanted")
-    if tensor.device.type != "cpu" or not tensor.is_contiguous():
-        raise ValueError(f"{name} must be contiguous and on the CPU; call .contiguous().cpu() before")

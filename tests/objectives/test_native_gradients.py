@@ -18,7 +18,8 @@ from coim.native import Source, find_compiler, team
 from coim.objectives import native_gradients
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
-from coim.objectives.native_gradients import AdamStep, NativeDynamics, NativeSAC, pays
+from coim.objectives.native_gradients import NativeDynamics, NativeSAC, pays
+from coim.objectives.native_structures import AdamStep, Dynamics, Layer, Sac
 
 CLAMPED = (-0.5, 0.5)  # of the log-scale: some are inside, some outside
 # Sizes of batch, observation, design, action, hidden layers; number of critics.
@@ -254,8 +255,8 @@ def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeyp
 def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
     """Names and sizes of all fields, in their order, as the compiler sees them."""
     checks = []
-    for structure in (native_gradients._Layer, native_gradients._Sac, native_gradients._Dynamics, AdamStep):
-        name = structure.__name__.removeprefix("_").removesuffix("Step")
+    for structure in (Layer, Sac, Dynamics, AdamStep):
+        name = structure.__name__.removesuffix("Step")
         checks.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(structure)});")
         for field, _ in structure._fields_:
             checks.append(f"static_assert(offsetof({name}, {field}) == {getattr(structure, field).offset});")
