@@ -19,6 +19,7 @@ from coim.buffers import Buffers
 from coim.envs.morph import MorphEnv
 from coim.envs.simulator_dream import SimulatorDynamics
 from coim.envs.world_model import WorldModelEnv
+from coim.governor import Governor
 from coim.learners.dynamics import DynamicsLearner
 from coim.learners.known_networks import check_exchangeable
 from coim.learners.sac import SACLearner
@@ -227,6 +228,19 @@ def check_model(env: MorphEnv, model: object) -> None:
         raise ValueError(
             f"the ensemble is not for {runs} run(s) of bodies of sizes {sizes}: it has {found[2]} and turns {found[0]} "
             f"numbers into {found[1]}; make it with GaussianEnsemble.for_env(env)"
+        )
+
+
+def check_governed(governor: Governor | None, *learners: SACLearner) -> None:
+    """Refuse a governor where the share of imagined rows decides nothing.
+
+    Raises:
+        ValueError: if a learner sums the means over real and over imagined rows.
+    """
+    if governor is not None and any(learner.loss.mix == "sum" for learner in learners):
+        raise ValueError(
+            "a governor sets the share of imagined rows, and with mix='sum' they count as much as all real ones, "
+            "whatever their share; make the learners with mix='batch'"
         )
 
 

@@ -19,7 +19,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from coim.agreement import check_bodies, check_buffers, check_counts, check_kinds, check_learners, check_networks
+from coim.agreement import (
+    check_bodies,
+    check_buffers,
+    check_counts,
+    check_governed,
+    check_kinds,
+    check_learners,
+    check_networks,
+)
 from coim.buffers import Buffers
 from coim.design_choice import DesignChoice, Situation
 from coim.envs.morph import MorphEnv
@@ -131,6 +139,7 @@ class CoAdaptation:
             plan = plan.without_imagination()
         else:
             imagined.check_fits(env, buffers.art, dynamics, design_choice.first_designs)
+            check_governed(imagined.governor, population, individual)
         check_buffers(env, buffers, imagined_rows=plan.imagined_rows)
         self.env, self.evaluation_env, self.buffers, self.design_choice = env, evaluation_env, buffers, design_choice
         self.population, self.individual, self.dynamics, self.imagined = population, individual, dynamics, imagined
@@ -247,7 +256,7 @@ class CoAdaptation:
             self.buffers.pop, self.population.policy, plan.imagined_rows, rng=rng, states_rng=states_rng
         )
         if self.imagined.governor is not None:
-            most = plan.rows("population").imagined / plan.batch_size
+            most = max(plan.rows(name).imagined for name in ("population", "individual")) / plan.batch_size
             metrics["imagined_share"] = self.imagined.governor.shares(most)
         return metrics
 

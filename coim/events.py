@@ -60,8 +60,8 @@ class EpisodeDone:
         env_steps: training steps of one run so far; evaluation steps are not counted, nothing is learnt from them.
         imagined: rows in Replay_Art of one run.
         metrics: means over the updates, each ``[K]``: losses, entropies; ``model_error``, the share of ``impossible``
-            pairs among those imagined, the ``imagined_share`` of a population batch if it is governed, and how often
-            the simulation has ``broken`` in the two episodes.
+            pairs among those imagined, the ``imagined_share`` of a batch if it is governed, the population's or the
+            individual's, whichever has more, and how often the simulation has ``broken`` in the two episodes.
         seconds: wall-clock by part; parts that run side by side overlap, ``episode`` is the whole.
         diverged: runs that have diverged, and where. One that diverges in this very episode has its losses in
             ``metrics`` as they came out, and is evaluated with the weights that it had before.

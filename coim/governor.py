@@ -50,7 +50,10 @@ class Governor:
     Nothing is drawn here. A run whose share is nothing is left as it is.
 
     Args:
-        ensemble: the model that imagines.
+        ensemble: the model that imagines, of at least two members.
+
+    Raises:
+        ValueError: if the ensemble has one member, which cannot disagree with any.
 
     Example:
         >>> governor = Governor(GaussianEnsemble(11, 3, 4, num_cells=(8,)))
@@ -62,6 +65,10 @@ class Governor:
     """
 
     def __init__(self, ensemble: GaussianEnsemble) -> None:
+        if ensemble.num_members < 2:
+            raise ValueError(
+                "the ensemble has one member, and a governor asks how far members disagree; give two or more"
+            )
         self.ensemble = ensemble
         runs = ensemble.num_runs or 1
         nothing = torch.full((runs,), torch.inf, dtype=torch.float32, device="cpu")

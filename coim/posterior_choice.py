@@ -62,7 +62,7 @@ class PosteriorChoice(DesignChoice):
         """Mean and deviation of the best return by each run's posterior; NaN for a run that has none yet."""
         if not any(isinstance(objective, DesignPosterior) for objective in objectives):
             return None
-        both = torch.full((2, len(design)), torch.nan)
+        both = torch.full((2, len(design)), torch.nan, device="cpu")
         for run, objective in enumerate(objectives):
             if isinstance(objective, DesignPosterior):
                 both[:, run] = torch.cat(objective.predict(design[run : run + 1])).cpu()

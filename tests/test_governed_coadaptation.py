@@ -53,6 +53,7 @@ def same(one: Any, other: Any, run: slice = slice(None)) -> bool:
     return bool(one == other)
 
 
+PARTS = ("env", "evaluation_env", "population", "individual", "buffers", "design_choice", "dynamics", "imagined")
 GOVERNED: dict[str, Any] = {"governed": True, "states_are": "matched", "anchored": True, "sigma": 0.1}
 
 
@@ -134,6 +135,22 @@ def test_the_share_of_impossible_pairs_is_counted_whatever_is_imagined(settings:
     assert shares.shape == (7, 3)
     assert ((shares >= 0) & (shares <= 1)).all()
     assert bool(shares.any()) is (settings.get("states_are") != "matched")
+
+
+def test_the_share_that_is_told_is_that_of_the_learner_that_imagines_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_errors(monkeypatch, 0.4)
+    monkeypatch.setattr("coim.governor.AGREED", 0.0)
+    alone = small(1, **GOVERNED, imagined_share=0.0, individual_imagined_share=0.2, batch_size=20)
+    shares = [event.metrics["imagined_share"].tolist() for event in alone if isinstance(event, EpisodeDone)]
+    assert shares == [pytest.approx([0.125])] * 7
+
+
+@pytest.mark.parametrize("learner", ["population", "individual"])
+def test_a_governor_is_refused_where_the_share_decides_nothing(learner: str) -> None:
+    parts = {name: value for name, value in vars(small(1, **GOVERNED)).items() if name in PARTS}
+    parts[learner].loss.mix = "sum"
+    with pytest.raises(ValueError, match="a governor sets the share of imagined rows, and with mix='sum' they count"):
+        CoAdaptation(**parts)
 
 
 def test_a_governed_run_that_is_interrupted_goes_on_as_it_would_have(monkeypatch: pytest.MonkeyPatch) -> None:

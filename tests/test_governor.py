@@ -28,6 +28,11 @@ def test_nothing_is_imagined_before_anything_was_measured() -> None:
     assert not governor(3).earns()
 
 
+def test_one_member_disagrees_with_nobody_and_is_refused() -> None:
+    with pytest.raises(ValueError, match="the ensemble has one member, and a governor asks how far members disagree"):
+        Governor(GaussianEnsemble(3, 2, 2, num_cells=(16,), num_members=1))
+
+
 def test_the_share_grows_from_a_twentieth_to_the_whole_as_the_error_falls() -> None:
     assert shares_after(1.0) == 0.0  # a model that knows nothing
     assert shares_after(UNEARNED) == 0.0

@@ -24,3 +24,15 @@ def bounds_for(design: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tenso
             f"pass [*B, {len(low)}]"
         )
     return low.to(design), high.to(design)
+
+
+def in_unit_cube(design: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Where designs ``[*B, D]`` are between the bounds, 0 to 1 in each entry; 0 in one that is held fixed.
+
+    Example:
+        >>> import torch
+        >>> in_unit_cube(torch.tensor([1.0, 1.2]), torch.tensor([0.5, 1.2]), torch.tensor([2.5, 1.2]))
+        tensor([0.2500, 0.0000])
+    """
+    width = high - low
+    return (design - low) / width.where(width > 0, 1)

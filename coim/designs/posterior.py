@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from .bounds import bounds_for, bounds_of
+from .bounds import bounds_for, bounds_of, in_unit_cube
 from .search import Fitness, evaluate
 
 try:
@@ -162,7 +162,8 @@ class DesignPosterior:
 
         The design in the unit cube; the order of building, from 0 to 1; the prior's value, standardised.
         """
-        return self._inputs(designs, self._values(designs), torch.ones(len(designs), 1, dtype=torch.float64))
+        order = torch.ones(len(designs), 1, dtype=torch.float64, device="cpu")
+        return self._inputs(designs, self._values(designs), order)
 
     @property
     def slope(self) -> float:
@@ -190,12 +191,12 @@ class DesignPosterior:
     def _values(self, designs: Tensor) -> Tensor:
         """The prior's values ``[P, 1]``; 0 without one."""
         if self.prior is None:
-            return torch.zeros(len(designs), 1, dtype=torch.float64)
+            return torch.zeros(len(designs), 1, dtype=torch.float64, device="cpu")
         return evaluate(self.prior, designs).to("cpu", torch.float64).unsqueeze(-1)
 
     def _inputs(self, designs: Tensor, values: Tensor, order: Tensor) -> Tensor:
         low, high = bounds_for(designs, self._low, self._high)
-        place = ((designs - low) / (high - low)).to("cpu", torch.float64)
+        place = in_unit_cube(designs, low, high).to("cpu", torch.float64)
         return torch.cat([place, order, (values - self._value_mean) / self._value_scale], -1)
 
 
@@ -228,10 +229,13 @@ def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
 
     inputs, targets = inputs.clone(), targets.clone()  # those of an inference mode have no gradients
     num_entries = inputs.shape[-1] - 2
-    smooth = RBFKernel(
-        active_dims=tuple(range(num_entries)), lengthscale_prior=around(LENGTH), lengthscale_constraint=positive(LENGTH)
-    )
-    with botorch.settings.validate_input_scaling(False):  # the last input may leave the unit cube
+    # On the CPU whatever torch's default device is; the last input may leave the unit cube.
+    with torch.device("cpu"), botorch.settings.validate_input_scaling(False):
+        smooth = RBFKernel(
+            active_dims=tuple(range(num_entries)),
+            lengthscale_prior=around(LENGTH),
+            lengthscale_constraint=positive(LENGTH),
+        )
         model = SingleTaskGP(
             inputs,
             targets.unsqueeze(-1),

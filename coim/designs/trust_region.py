@@ -12,7 +12,7 @@ from __future__ import annotations
 from torch import Tensor
 from torchrl.data import Bounded
 
-from .bounds import bounds_for, bounds_of
+from .bounds import bounds_for, bounds_of, in_unit_cube
 from .search import DesignSearch, Fitness
 
 
@@ -24,7 +24,7 @@ class TrustRegion:
 
     Args:
         spec: bounds of one design, ``[D]``, as ``env.design_spec``.
-        search: that maximises over ``spec``.
+        search: that maximises over ``spec``, or over a part of it, which it does not leave here either.
         reach: half the length of the box, as a share of the range of each entry, in (0, 1].  The box ends where the
             design space does.
 
@@ -59,10 +59,12 @@ class TrustRegion:
                 "give one body that was built"
             )
         step = self.reach * (high - low)
-        start, end = (centre - step).clamp(min=low), (centre + step).clamp(max=high)
+        if (own := getattr(self.search, "spec", None)) is not None:
+            low, high = bounds_for(centre, *bounds_of(own))
+        start, end = (centre - step).clamp(low, high), (centre + step).clamp(low, high)
 
         def moved(designs: Tensor) -> Tensor:
-            share = (designs - low) / (high - low)
+            share = in_unit_cube(designs, low, high)
             return (start + share * (end - start)).clamp(start, end)
 
         found, value = self.search.maximise(lambda designs: fitness(moved(designs)))

@@ -214,6 +214,37 @@ def test_a_trust_region_holds_the_best_near_its_centre_and_ends_at_the_bounds() 
     assert at_edge.tolist() == pytest.approx([0.5, 1.7])
 
 
+def test_a_trust_region_stays_where_its_search_looks() -> None:
+    narrow = Bounded(low=1.0, high=1.2, shape=(2,), dtype=torch.float32)
+    region = TrustRegion(SPEC, GradientSearch(narrow, seed=0), reach=0.05)
+    for slope in (-1.0, 1.0):
+        for centre, reached in ((1.1, 1.1 + slope * 0.075), (0.6, 1.0), (1.9, 1.2)):
+            found, _ = region.maximise(lambda x, slope=slope: slope * x.sum(-1), centre=torch.full((2,), centre))
+            assert found.tolist() == pytest.approx([reached] * 2)
+
+
+def test_an_entry_may_be_held_fixed() -> None:
+    spec = Bounded(low=torch.tensor([LOW, 1.2]), high=torch.tensor([HIGH, 1.2]), shape=(2,), dtype=torch.float32)
+    designs = built(12)
+    designs[:, 1] = 1.2
+    posterior = DesignPosterior(spec, designs, returns_of(designs))
+    found, _ = GradientSearch(spec, seed=0).maximise(posterior)
+    assert found.tolist() == pytest.approx([TOP[0].item(), 1.2], abs=0.2)
+    assert all(part.isfinite().all() for part in posterior.predict(designs))
+    near, _ = TrustRegion(spec, GradientSearch(spec, seed=0), reach=0.2).maximise(bowl, centre=torch.tensor([1.1, 1.2]))
+    assert near.tolist() == pytest.approx([1.0, 1.2], abs=0.01)
+
+
+def test_numbers_stay_on_the_cpu_under_another_default_device() -> None:
+    designs = built(12)
+    returns = returns_of(designs)
+    for prior in (None, bowl):
+        expected = DesignPosterior(SPEC, designs, returns, prior=prior).predict(designs)
+        with torch.device("meta"):
+            again = DesignPosterior(SPEC, designs, returns, prior=prior)
+            assert all(torch.equal(one, other) for one, other in zip(expected, again.predict(designs)))
+
+
 def test_a_trust_region_refuses_a_centre_outside_and_a_reach_of_nothing() -> None:
     search = GradientSearch(SPEC, seed=0)
     with pytest.raises(ValueError, match=r"the centre \[2.5, 1.0\] is not a design"):

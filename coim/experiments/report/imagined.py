@@ -129,7 +129,8 @@ def _draw_share(axes: Axes, records: Sequence[Record]) -> None:
         for reason, (colour, _) in FORBIDDEN.items():
             rows = record.episodes[record.episodes["reason"] == reason]
             axes.scatter(rows["env_steps"], np.zeros(len(rows)), s=16, color=colour, marker="x", zorder=4)
-    most = max(record.settings.get("imagined_share", 1.0) for record in governed)
+    names = ("imagined_share", "individual_imagined_share")
+    most = max(record.settings.get(name, 0.0) for record in governed for name in names) or 1.0
     axes.set(ylabel="imagined share\nof a batch", ylim=(-0.06 * most, 1.06 * most))
 
 

@@ -152,8 +152,9 @@ def still_finished(settings: Settings, folder: Path) -> bool:
     """
     if not (folder / "config.json").exists():
         return False
-    saved = read_config(folder)["settings"]
-    settings = with_episodes_as_begun(settings, in_native_code=saved.get("native_episodes", False))
+    before = {name: value for name, value in plain(Settings()).items() if name in LATER}
+    saved = before | read_config(folder)["settings"]
+    settings = with_episodes_as_begun(settings, in_native_code=saved["native_episodes"])
     asked = json.loads(json.dumps(plain(settings)))
     more = asked["num_designs"] > saved["num_designs"]
     fixed = (saved.keys() & asked.keys()) - OF_NO_NUMBER | (set() if more else {"num_designs"})

@@ -185,6 +185,15 @@ class Settings:
             raise ValueError(
                 "`governed` has no errors to go by with `dream` simulator, which makes none; leave one of them out"
             )
+        if self.governed and self.mix == "sum":
+            raise ValueError(
+                "`governed` sets the share of imagined rows, and with `mix` sum they count as much as all real ones, "
+                "whatever their share; take batch, or leave governed out"
+            )
+        if self.governed and self.num_members < 2:
+            raise ValueError(
+                "`governed` asks how far the members of the model disagree, and `num_members` is 1; take 2 or more"
+            )
         batch_parts(self.batch_size, imagined=self.imagined_share)
         batch_parts(self.batch_size, imagined=self.individual_imagined_share, other=self.individual_mix)
 

@@ -18,7 +18,7 @@ from coim.envs import BODIES
 from coim.experiments.run.effect import without_effect
 from coim.experiments.run.pydantic_errors import CONFIG, refused_in_words, sentence
 from coim.experiments.run.settings import FIELDS, LISTS, PRESETS, Amount, Count, Settings, Task
-from coim.experiments.study.arms import ARMS, arm_named
+from coim.experiments.study.arms import ARMS, arm_named, in_order
 
 PAPER = PRESETS["paper"]
 Protocol = Literal["paper", "preview", "pilot", "smoke"]
@@ -127,7 +127,7 @@ class Study(Block):
 
     Raises:
         ValueError: if a name is not known, a seed comes twice, a cell has settings that no run can have, or an override
-            changes nothing in any cell.
+            changes nothing in any cell, or is one that an arm sets itself: it would change the other arms alone.
 
     Example:
         >>> study = Study(name="tiny", environments=("hopper",), arms=("none", "known"), seeds=(0, 1), protocol="smoke")
@@ -168,9 +168,14 @@ class Study(Block):
         return sorted(cells, key=lambda cell: cell.position)  # stable: within a position in the order of the blocks
 
     def _refuse_without_effect(self, overrides: Mapping[str, Any], cells: Sequence[Cell]) -> None:
-        """Refuse an override that changes nothing in any of the cells that it is meant for."""
+        """Refuse an override that changes nothing in any of the cells that it is meant for, or not in all arms."""
         idle = [without_effect(cell.settings) for cell in cells]
         for name in overrides:
+            if own := [arm for arm in in_order(cell.arm for cell in cells) if name in ARMS[arm].settings]:
+                raise ValueError(
+                    f"the override of {name} does not reach {', '.join(own)}, as these arms set it themselves; leave "
+                    "it out, or give it to the other arms in a block of theirs"
+                )
             if all(name in found for found in idle):
                 raise ValueError(f"in the overrides {idle[0][name]}")
 

@@ -96,6 +96,16 @@ def test_no_number_is_without_a_limit() -> None:
             "error: --dream simulator imagines nothing with --imagine none; take known, noisy or random\n",
         ),
         (
+            ["--governed", "--mix", "sum"],
+            "error: --governed sets the share of imagined rows, and with --mix sum they count as much as all real "
+            "ones, whatever their share; take batch, or leave governed out\n",
+        ),
+        (
+            ["--governed", "--num-members", "1"],
+            "error: --governed asks how far the members of the model disagree, and --num-members is 1; take 2 or "
+            "more\n",
+        ),
+        (
             ["--dream", "simulator", "--governed"],
             "error: --governed has no errors to go by with --dream simulator, which makes none; leave one of them "
             "out\n",

@@ -15,7 +15,7 @@ from coim import EpisodeDone, HopperMorph
 from coim.envs import BODIES
 from coim.experiments.commands.study import main as entry
 from coim.experiments.run.build import build
-from coim.experiments.run.resume import still_finished, to_go_on
+from coim.experiments.run.resume import LATER, still_finished, to_go_on
 from coim.experiments.run.settings import METHODS, Settings, plain
 from coim.experiments.study.arms import ARMS
 from coim.experiments.study.cell import compute, episodes_done, seconds_of, tries
@@ -112,6 +112,24 @@ def test_an_override_that_changes_nothing_where_it_is_written_is_refused() -> No
     more = Block(environments=("walker",), arms=("none",), seeds=(9,), overrides={"model_lr": 0.1})
     with pytest.raises(ValueError, match="model_lr has no effect with imagine none"):
         study(arms=("known",), blocks=(more,))
+
+
+def test_an_override_that_some_arms_would_not_hear_is_refused() -> None:
+    """It would change what the others are, under their names, or nothing at all."""
+    cases = {
+        ("grounded",): {"reach": 0.5},
+        ("none", "returns"): {"chosen_by": "posterior"},
+        ("grounded", "grounded-governed-both"): {"individual_imagined_share": 0.1},
+    }
+    for arms, overrides in cases.items():
+        (name,) = overrides
+        with pytest.raises(ValueError, match=f"the override of {name} does not reach {arms[-1]}, as these arms set it"):
+            study(arms=arms, overrides=overrides)
+    same = study(arms=("none", "known"), overrides={"chosen_by": "returns"})
+    assert {cell.settings.chosen_by for cell in same.cells()} == {"returns"}
+    more = Block(environments=("walker",), arms=("grounded",), seeds=(9,))
+    with pytest.raises(ValueError, match="the override of reach does not reach grounded"):
+        study(arms=("none",), overrides={"reach": 0.5}, blocks=(more,))
 
 
 @pytest.mark.parametrize(("seeds", "twice"), [((3,), "none-3"), ((4, 3), "none-3, hopper-forward-none-4")])
@@ -388,6 +406,17 @@ def test_a_cell_with_episodes_in_python_is_finished_for_a_protocol_that_has_nati
             still_finished(TINY, tmp_path)
     else:
         assert still_finished(TINY, tmp_path)
+
+
+def test_a_finished_cell_of_before_a_setting_has_its_default(tmp_path: Path) -> None:
+    settings = {name: value for name, value in plain(TINY).items() if name not in LATER}
+    (tmp_path / "config.json").write_text(json.dumps({"environment": "hopper", "settings": settings}))
+    assert still_finished(TINY, tmp_path)
+    for changed in ({"chosen_by": "returns"}, {"governed": True}, {"value_states": "matched"}):
+        ((name, value),) = changed.items()
+        was = getattr(TINY, name)
+        with pytest.raises(ValueError, match=rf"made with other settings: {name} \({was!r} to {value!r}\)"):
+            still_finished(dataclasses.replace(TINY, **changed), tmp_path)
 
 
 def all_episodes_of(settings: Settings) -> int:
