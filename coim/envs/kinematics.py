@@ -172,7 +172,8 @@ class Kinematics:
         height = find_height(model)
         if height is None:
             raise ValueError(
-                "nothing moves this body up and down: its root has neither a free joint nor a vertical slide"
+                "nothing moves this body up and down: its root has neither a free joint nor a vertical slide that no "
+                "hinge of the root turns"
             )
         self._root, self.height = roots[0], height
         self._positions_at_start = torch.from_numpy(model.qpos0.copy())

@@ -82,12 +82,20 @@ def read_root(model: mujoco.MjModel, name: str) -> Root:
 
 
 def find_height(model: mujoco.MjModel) -> int | None:
-    """Return the entry of the positions that moves the whole robot up, or None if none does."""
+    """Return the entry of the positions that moves the whole robot up, or None if none does.
+
+    A slide does so if it is vertical in the world, whatever the others do: in a root that is turned its own axis may be
+    another one, and behind a hinge it turns with that.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
     for joint in range(model.njnt):
         at, of_root = int(model.jnt_qposadr[joint]), model.body_parentid[model.jnt_bodyid[joint]] == 0
-        if of_root and model.jnt_type[joint] == FREE:
+        if not of_root or model.jnt_type[joint] not in (FREE, SLIDE):
+            return None
+        if model.jnt_type[joint] == FREE:
             return at + 2
-        if of_root and model.jnt_type[joint] == SLIDE and np.allclose(model.jnt_axis[joint], (0, 0, 1)):
+        if np.allclose(data.xaxis[joint], (0, 0, 1)):
             return at
     return None
 

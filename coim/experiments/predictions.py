@@ -140,6 +140,10 @@ def mean_of_runs(values: ArrayLike) -> Estimate:
 def worth_of_search(designs: pd.DataFrame) -> Estimate:
     """Mean best return of a run's optimised bodies minus that of its random ones, which take turns.
 
+    With an odd number of later bodies both have the same mean place in the order of building. With an even one, as in
+    the paper's protocol, random bodies are built one place later, when the controller has learnt more: what a body
+    gains by its place is then counted against the search.
+
     Args:
         designs: rows of one run with ``kind`` and ``best_return``, all finite.
     """

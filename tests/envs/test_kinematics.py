@@ -153,3 +153,41 @@ def test_a_body_that_nothing_moves_up_is_refused() -> None:
     )
     with pytest.raises(ValueError, match="neither a free joint nor a vertical slide"):
         Kinematics(lambda design: arm.copy().compile(), bounds=(0.5, 2.0), size=1)
+
+
+def on_a_root(joints: str, turned: str = "") -> Kinematics:
+    """Heights of a torso with a leg, whose root has these joints and is turned like that in the world."""
+    robot = mujoco.MjSpec.from_string(
+        f"<mujoco><worldbody><body name='torso' pos='0 0 1' {turned}>{joints}<geom type='capsule' fromto='0 0 0 0 0 .3'"
+        " size='.05'/><body name='leg'><joint axis='0 1 0'/><geom type='capsule' fromto='0 0 0 0 .1 -.5' size='.04'/>"
+        "</body></body></worldbody></mujoco>"
+    )
+    model = robot.compile()
+    found = Kinematics(lambda design: robot.copy().compile(), bounds=(0.5, 2.0), size=1)
+    data = mujoco.MjData(model)
+    for positions in np.random.default_rng(0).normal(scale=0.7, size=(20, model.nq)):
+        data.qpos[:] = positions
+        mujoco.mj_kinematics(model, data)
+        radius, half = model.geom_size[:, 0], model.geom_size[:, 1]
+        lowest = (data.geom_xpos[:, 2] - radius - half * np.abs(data.geom_xmat[:, 8])).min()
+        clearance = found.lowest(torch.from_numpy(positions), torch.ones(1, dtype=torch.float64))
+        assert clearance.item() == pytest.approx(lowest, abs=1e-9)
+    return found
+
+
+def test_a_root_that_is_turned_rises_along_the_slide_that_is_vertical_in_the_world() -> None:
+    assert on_a_root("<joint type='slide' axis='0 0 1'/>").height == 0
+    assert on_a_root("<joint type='slide' axis='1 0 0'/>", "euler='0 -90 0'").height == 0
+    across = "<joint type='slide' axis='0 0 1'/><joint type='slide' axis='-1 0 0'/><joint axis='0 1 0'/>"
+    assert on_a_root(across, "euler='0 90 0'").height == 1
+
+
+@pytest.mark.parametrize("turned", ["euler='180 0 0'", "euler='0 90 0'", "euler='0 30 0'"])
+def test_a_slide_that_is_not_vertical_in_the_world_is_no_height(turned: str) -> None:
+    with pytest.raises(ValueError, match="neither a free joint nor a vertical slide"):
+        on_a_root("<joint type='slide' axis='0 0 1'/>", turned)
+
+
+def test_a_slide_behind_a_hinge_is_no_height() -> None:
+    with pytest.raises(ValueError, match="a vertical slide that no hinge of the root turns"):
+        on_a_root("<joint axis='0 1 0'/><joint type='slide' axis='0 0 1'/>")

@@ -29,7 +29,9 @@ def shown(section: Section | None) -> Section:
 def test_every_body_is_shown_with_its_interval_and_how_many_held(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", RETURNS, told=TOLD, chosen_by="returns")
     section = shown(expectations(read_records([folder])))
-    assert section.notes[0].startswith("2 of 3 best returns (67 %) lie within their 90 % interval. Of intervals that")
+    assert section.notes[0].startswith(
+        "After the first bodies, 2 of 3 best returns (67 %) lie within their 90 % interval. Of intervals that"
+    )
     assert "rank correlation 0.87 (n = 3 designs)" in section.notes[1]  # ranks 3, 1.5, 1.5 and 3, 1, 2
     (table,) = section.tables
     assert table.head == ["", "kind", "expected", "5 %", "95 %", "best return", "within"]
@@ -52,7 +54,7 @@ def test_folders_are_compared_by_what_was_expected(tmp_path: Path) -> None:
         write_run(tmp_path / "value", RETURNS),
     ]
     section = shown(expectations(read_records(folders)))
-    assert section.notes[0].startswith("returns: 2 of 3 best returns")
+    assert section.notes[0].startswith("returns: After the first bodies, 2 of 3 best returns")
     assert section.notes[-1].startswith("value: no return was expected")
 
 
@@ -63,6 +65,9 @@ def test_the_search_is_worth_optimised_minus_random_bodies(tmp_path: Path) -> No
     assert (name, cells[:5]) == ("run 0", ["2", "400", "2", "200", "200"])
     assert cells[5] == "-491.9 to 891.9"  # 200 -+ t x sqrt(100^2 + 50^2), t = 6.19 of 1.47 degrees of freedom
     assert section.notes[0].startswith("the interval of one run reaches 692 to each side")
+    assert section.notes[1].startswith("The random bodies were built later on the mean")  # the fifth and seventh
+    balanced = shown(worth(read_records([write_run(tmp_path / "balanced", (*RETURNS, 250.0, 400.0))])))
+    assert not any("built later" in note for note in balanced.notes)
     fleet = write_run(tmp_path / "fleet", (*RETURNS, 250.0), (*RETURNS, 450.0))
     section = shown(worth(read_records([fleet])))
     assert section.tables[0].rows[-1][0] == "mean of 2 runs"
