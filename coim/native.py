@@ -57,20 +57,25 @@ class Source:
         texts = (file.read_text() for file in (self.path, *self.headers))
         parts = (*texts, predefined, repr(command), self.made_from)
         path = folder() / f"{self.path.stem}-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.so"
-        if path.exists():
+        if _is_whole(path):
             try:
                 return ctypes.CDLL(str(path))
-            except OSError:  # half a file
+            except OSError:  # made with another C library, in a folder that several machines share
                 pass
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=path.parent) as beside:
-                made = Path(beside) / path.name
+                made, seal = (Path(beside) / name for name in (path.name, _seal(path).name))
                 self.run([*command, str(self.path), "-o", str(made)])
+                seal.write_text(_digest(made))
                 os.replace(made, path)
+                os.replace(seal, _seal(path))
             return ctypes.CDLL(str(path))
         except OSError as error:
-            raise RuntimeError(f"{self.purpose} cannot be kept in {path.parent}, {self.way_out}: {error}") from error
+            raise RuntimeError(
+                f"{self.purpose} cannot be kept in {path.parent}; name another folder by the environment variable "
+                f"TORCHINDUCTOR_CACHE_DIR, or {self.way_out}: {error}"
+            ) from error
 
     def command(self, compiler: str) -> tuple[list[str], str]:
         """Call of the compiler for this processor, and what it predefines then."""
@@ -94,6 +99,23 @@ class Source:
             said = done.stderr[-2000:] or f"it ended with {done.returncode}"
             raise RuntimeError(f"{refused}; {' '.join(command)}: {said}")
         return done.stdout
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a library is as it was made. Half a file can be loaded too, and then ends the process."""
+    try:
+        return _seal(path).read_text() == _digest(path)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _seal(path: Path) -> Path:
+    """The file beside a library that has its digest."""
+    return path.with_suffix(".sha256")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def find_compiler(way_out: str) -> str:

@@ -129,7 +129,9 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: Activation = "no
     if emulated(x):
         return affine(x.float(), weight.float(), bias.float(), activation).to(x.dtype)
     if _by_onednn(x, weight):
-        return _onednn(x, weight.t(), bias, activation)
+        # Its own ReLU turns NaN into 0, so that networks that have diverged would look sound.
+        y = _onednn(x, weight.t(), bias, "none" if activation == "relu" else activation)
+        return y.relu_() if activation == "relu" else y
     y = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(-2), x, weight)
     if activation == "none":
         return y
@@ -168,7 +170,8 @@ def _by_onednn(x: Tensor, other: Tensor) -> bool:
 
 def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None = None, activation: Activation = "none") -> Tensor:
     """``activation(x @ weight.T + bias)``, as PyTorch's operator takes it: weight ``[O, F]``."""
-    return _LINEAR(x, weight, bias, activation, [], "")
+    # It reads a bias as if it were contiguous, whatever its strides.
+    return _LINEAR(x, weight, None if bias is None else bias.contiguous(), activation, [], "")
 
 
 def _check(choice: Choice) -> None:

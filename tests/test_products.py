@@ -81,6 +81,25 @@ def test_slices_and_transposes_are_read_as_they_are(way: Choice) -> None:
     torch.testing.assert_close(products.affine(x, weight, bias), x @ weight, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("lies", ["every second one", "one number for all"])
+def test_a_bias_is_read_wherever_it_lies(way: Choice, lies: str) -> None:
+    x, weight = random(60, 23, dtype=torch.float32), random(23, 200, dtype=torch.float32)
+    bias = random(400, dtype=torch.float32)[::2] if lies == "every second one" else torch.full((1,), 0.7).expand(200)
+    torch.testing.assert_close(products.affine(x, weight, bias), x @ weight + bias, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("activation", ["none", "relu", "swish"])
+def test_a_number_that_is_no_number_stays_one(way: Choice, dtype: torch.dtype, activation: products.Activation) -> None:
+    """A run that diverges is found by its losses, whichever library multiplies."""
+    x, weight, bias = random(20, 23, dtype=dtype), random(23, 12, dtype=dtype), random(12, dtype=dtype)
+    x[3, 5] = bias[7] = torch.nan
+    lost = products.affine(x, weight, bias, activation).isnan()
+    assert lost[3].all()
+    assert lost[:, 7].all()
+    assert lost.sum() == 20 + 12 - 1
+
+
 def test_emulated_bfloat16_is_rounded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     products.use(Choice("torch", "emulated"))
     x, weight = random(40, 23, dtype=torch.bfloat16), random(23, 12, dtype=torch.bfloat16)

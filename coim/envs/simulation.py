@@ -119,10 +119,21 @@ class Simulations:
         Each body is compiled from scratch, so that everything that depends on lengths (masses, inertias, bounding
         volumes, start pose) is right. To change fields of a compiled model is faster, but one forgotten field makes
         others wrong.
+
+        Raises:
+            ValueError: if a body has other parts than those of the fleet, which stays as it was.
         """
+        models = list(self._models)
         for row, model in zip(rows, self._compiled(designs)):
-            self._models[row] = model
-        self._batch.set_models(self._models)
+            models[row] = model
+        try:
+            self._batch.set_models(models)
+        except mujoco.FatalError as error:
+            raise ValueError(
+                f"a body of designs {designs.tolist()} has other parts than those of the fleet ({error}); "
+                "shape_body may move and resize parts, and add or remove none"
+            ) from error
+        self._models = models
 
     def _compiled(self, designs: np.ndarray) -> list[mujoco.MjModel]:
         """Compile the bodies of the designs, once for all rows with the same design."""

@@ -97,19 +97,17 @@ def train(
     side_by_side = prepare(threads, checked_device(settings.device))
     products = begin_or_resume(name, settings)
     if needing := [name for name in ("compile", "native_episodes") if getattr(settings, name)]:
-        check_compiler(without=" ".join(option(f"no_{name}") for name in needing))
-    on_cpu = torch.device(settings.device).type == "cpu"
-    narrow = min(max(settings.num_cells, default=0), max(settings.model_cells, default=0)) <= UP_TO
-    native = settings.compile and on_cpu and settings.precision == "float32" and narrow
-    check_native_code(gradients=native, episodes=settings.native_episodes)
+        without = " ".join(option(f"no_{name}") for name in needing)
+        check_compiler(without, makes=settings.compile and not has_native_gradients(settings))
+    check_native_code(gradients=has_native_gradients(settings), episodes=settings.native_episodes)
     check_logger(settings.log)
     with folder_of(name, settings) as folder:
         algorithm = make(folder, threads, side_by_side)
     if not settings.quiet:
         learners = "learners side by side, one thread each" if side_by_side else "one thread"
-        compiled = "native gradients" if native else "compiled in the first episode"
-        how = compiled if native or (settings.compile and not on_cpu) else "not compiled"
+        on_cpu = torch.device(settings.device).type == "cpu"
         by = f", products by {words_of(products)}" if on_cpu else ""
+        how = how_gradients_are_computed(algorithm, settings)
         print(f"{name}: {settings.num_runs} run(s) on {settings.device}, {learners}, {how}{by} -> {folder}")
         if on_cpu and settings.precision == "bfloat16" and products.bfloat16 == "emulated":
             print("bfloat16 is emulated by float32 products here, which is slower than --precision float32")
@@ -139,6 +137,27 @@ def train(
     if not settings.quiet:
         print("\n".join([f"picture: {picture}", f"report: {report}", *last_words(folder, name, body, settings)]))
     return folder
+
+
+def has_native_gradients(settings: Settings) -> bool:
+    """Whether a run computes gradients in native code, of policy and critics or of a model."""
+    if not settings.compile or torch.device(settings.device).type != "cpu" or settings.precision != "float32":
+        return False
+    learns_a_model = settings.imagine != "none" and settings.dream == "ensemble"
+    return min(max(cells) for cells in (settings.num_cells, *[settings.model_cells] * learns_a_model)) <= UP_TO
+
+
+def how_gradients_are_computed(algorithm: Followed, settings: Settings) -> str:
+    """A few words for the first line of a run."""
+    if settings.compile and torch.device(settings.device).type != "cpu":
+        return "compiled in the first episode"
+    learners = algorithm.training.learners
+    native = [name for name, learner in learners.items() if learner.native]
+    if not native:
+        return "not compiled"
+    if len(native) == len(learners):
+        return "native gradients"
+    return f"native gradients of {'the model' if 'model' in native else 'policy and critics'}"
 
 
 def follow(algorithm: Followed, folder: Path, name: str, settings: Settings) -> None:

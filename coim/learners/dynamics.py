@@ -43,7 +43,8 @@ class DynamicsLearner(FlatLearner):
         precision: ``"bfloat16"`` computes the network's products in bfloat16; weights, moments, targets and losses
             stay as they are.
         compile: compute the gradients by compiled code, made in the first update; results differ by rounding. On a CPU
-            that is native code, for float32 and layers up to 256 units; all else there is as without.
+            that is native code, for weights of float32 or float64 and layers up to 256 units; all else there is as
+            without.
 
     Attributes:
         loss: the `EnsembleNLLLoss` over the same parameters, for those who want its value or its gradients.
@@ -181,7 +182,7 @@ class DynamicsLearner(FlatLearner):
             for flat in (self._read_weights, self._gradient)
         )
         # A CPU multiplies the matrices of one member after the other; a GPU takes all members in one product.
-        in_one = self._read_weights.dtype == torch.float64 and not self._native
+        in_one = self._read_weights.dtype == torch.float64 and not self.native
         self._stacked = self._weights.device.type != "cpu" or in_one
         members = [slice(None)] if self._stacked else range(len(read[0]))
         self._networks = [Network([w[m] for w in read[0::2]], [b[m] for b in read[1::2]]) for m in members]
@@ -193,7 +194,7 @@ class DynamicsLearner(FlatLearner):
         raw = torch.cat([observation, batches["action"], batches["design"]], -1)
         inputs = self.ensemble.inputs(raw).to(self._read_weights.dtype)
         targets = self.ensemble.standardised_target(observation, batches["next", "observation"])
-        if self._native:
+        if self.native:
             targets = targets.to(self._weights.dtype)
         return runs_first(inputs, self.num_runs), runs_first(targets, self.num_runs)
 
@@ -206,7 +207,7 @@ class DynamicsLearner(FlatLearner):
             batches = [pair for pair in zip(x, target) for _ in range(members)]
         threads, losses = torch.get_num_threads(), []
         for member, (network, own, batch) in enumerate(zip(self._networks, self._gradients, batches)):
-            if self._native:
+            if self.native:
                 make = partial(NativeDynamics, network, own, *batch, log_var_range=LOG_VAR_RANGE, threads=threads)
                 losses.append(self._prepared(member, make)(*batch))
             else:

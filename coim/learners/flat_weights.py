@@ -42,6 +42,7 @@ class FlatLearner:
 
     Attributes:
         num_runs: K, or None.
+        native: whether gradients are computed in native code.
         optimiser: Adam over the flat buffer. Its settings may be changed at any time; the next update follows.
 
     Raises:
@@ -83,7 +84,7 @@ class FlatLearner:
         self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
         self.optimiser = self._updates.optimiser
         on_cpu = self._weights.device.type == "cpu"
-        self._native = compile and on_cpu and precision == "float32" and pays(self._parameters())
+        self.native = compile and on_cpu and precision == "float32" and pays(self._parameters())
         self._compiled = Compiled(gradients) if compile and not on_cpu else None
         self._plain: Callable[..., Any] = gradients
         self._code: dict[int, Any] = {}  # while updates are done

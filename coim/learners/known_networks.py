@@ -89,6 +89,16 @@ def _check_parts(network: nn.Module, kinds: tuple[type[nn.Module], ...], learner
             f"{learner} knows the gradients of the networks of coim.models alone, and {altered}; train it with {loss} "
             "and an optimiser"
         )
+    odd = [
+        f"{name} has {', '.join(held)}"
+        for name, part in network.named_modules()
+        if isinstance(part, StackedLinear) and (held := [*dict(part.named_parameters())]) != ["weight", "bias"]
+    ]
+    if odd:  # it reads all parameters in their order
+        raise TypeError(
+            f"{learner} trains layers that have a weight and a bias, registered in this order, and {odd[0]} in the "
+            f"{type(network).__name__}; train it with {loss} and an optimiser"
+        )
     frozen = [name for name, parameter in network.named_parameters() if not parameter.requires_grad]
     if frozen:
         raise TypeError(

@@ -52,7 +52,8 @@ class SACLearner(FlatLearner):
         precision: ``"bfloat16"`` computes the networks' products in bfloat16; weights, moments, targets and losses
             stay as they are.
         compile: compute the gradients by compiled code, made in the first update; results differ by rounding. On a CPU
-            that is native code, for float32 and layers up to 256 units; all else there is as without.
+            that is native code, for weights of float32 or float64 and layers up to 256 units; all else there is as
+            without.
         seed: seeds the learner's own generator, which draws all noise of the policy.
 
     Attributes:
@@ -172,7 +173,7 @@ class SACLearner(FlatLearner):
         noise = self._noise(batches["action"]), self._noise(batches["action"])
         scaling = self.policy.network.scaling
         rows = sac_batch(batches, noise, scaling=scaling, mix=self.loss.mix, num_runs=self.num_runs)
-        if self._native:  # what is not native takes the dtype of the networks where it multiplies
+        if self.native:  # what is not native takes the dtype of the networks where it multiplies
             rows = Batch(*(x if x.dtype == torch.bool else x.to(self._weights.dtype) for x in rows))
         means = self._mean(rows)
         return TensorDict(dict(zip(("loss_actor", "loss_qvalue", "entropy"), means)), means.shape[1:])
@@ -180,7 +181,7 @@ class SACLearner(FlatLearner):
     def _mean(self, batches: Iterable[Tensor]) -> Tensor:
         """As `FlatLearner._mean`, in one call for many updates where native code does all that an update does."""
         optimiser = self.optimiser
-        if not (self._native and isinstance(optimiser, FlatAdam) and optimiser.is_plain()):
+        if not (self.native and isinstance(optimiser, FlatAdam) and optimiser.is_plain()):
             return super()._mean(batches)
         self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
         rows, found = Batch(*batches), []
@@ -205,7 +206,7 @@ class SACLearner(FlatLearner):
         threads, losses = torch.get_num_threads(), []
         for run, (networks, own) in enumerate(zip(self._networks, self._gradients)):
             batch = Batch(*(x[run] for x in rows)) if self._one_by_one else Batch(*rows)
-            if self._native:
+            if self.native:
                 make = partial(NativeSAC, *networks, own, batch, log_scale_range=LOG_SCALE_RANGE, threads=threads)
                 losses.append(self._prepared(run, make)(batch, **settings))
             else:

@@ -9,7 +9,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import cast
 
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
@@ -86,8 +87,9 @@ class PolicyNetwork(nn.Module):
             Weight ``[(K,) inputs, outputs]`` and bias ``[(K,) outputs]`` of each layer, as they lie in memory; what
             observations are divided by, ``[S]``; and the designs as the first layer reads them, ``[K, D]``.
         """
-        parameters = [parameter.detach() for parameter in self.mlp.parameters()]  # weight, bias, weight, bias, ...
-        layers = list(zip(parameters[0::2], parameters[1::2]))
+        layers = [
+            (layer.weight.detach(), layer.bias.detach()) for layer in cast(Iterable[StackedLinear], self.mlp.layers)
+        ]
         if self.scaling is None:
             return layers, design.new_ones(self.mlp.in_features - design.shape[-1]), design
         return layers, self.scaling.observation_scale, self.scaling.scaled_design(design)

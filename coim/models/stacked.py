@@ -208,8 +208,8 @@ class StackedMLP(nn.Module):
     def serves_bare(self, x: Tensor, num_rows: int) -> bool:
         """Return whether :meth:`forward_copy` is the faster path for ``num_rows`` rows per copy, and allowed.
 
-        It is for many rows on a CPU, outside of autograd, function transforms and compilers, as long as layers and
-        activation have no hooks and no `forward` of their own.
+        It is for many rows on a CPU, outside of autograd, autocast, function transforms and compilers, as long as
+        layers and activation have no hooks and no `forward` of their own.
         """
         return (
             num_rows >= FEW_ROWS
@@ -218,6 +218,7 @@ class StackedMLP(nn.Module):
             and x.device.type == "cpu"
             and x.dtype == self.layers[0].weight.dtype
             and x.dtype in (torch.float32, torch.bfloat16)
+            and not torch.is_autocast_enabled("cpu")  # which chooses the precision of products itself
             and not torch.compiler.is_compiling()
             and torch._C._functorch.peek_interpreter_stack() is None
             and called_as(self.activation, type(self.activation))

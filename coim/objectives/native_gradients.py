@@ -60,8 +60,8 @@ def library() -> ctypes.CDLL:
 
 
 def pays(weights: Sequence[Tensor]) -> bool:
-    """Whether native code is known to be faster for networks with such weights and biases, ``[*, O]``."""
-    return max(part.shape[-1] for part in weights) <= UP_TO
+    """Whether there is native code for networks with such weights and biases, ``[*, O]``, known to be faster."""
+    return all(part.dtype in NUMBERS and part.shape[-1] <= UP_TO for part in weights)
 
 
 class NativeSAC:

@@ -48,8 +48,8 @@ void store(T* at, Vector<T> x) {
   *reinterpret_cast<Vector<T>*>(at) = x;
 }
 
-// e^x. In float by the polynomial of Cephes (netlib.org/cephes, expf), to two units in the last place; 0 where torch has less
-// than a normal float; NaN stays NaN.
+// e^x. In float by the polynomial of Cephes (netlib.org/cephes, expf), to two units in the last place; at least
+// the smallest normal float; NaN stays NaN.
 template <class T>
 Vector<T> exponential(Vector<T> given) {
   Vector<T> x = given;
@@ -69,7 +69,6 @@ Vector<T> exponential(Vector<T> given) {
     y = y * (r * r) + r + 1.0f;
     const Whole power = (__builtin_convertvector(n, Whole) + 127) << 23;
     y *= reinterpret_cast<const Vector<T>&>(power);
-    y = given < least ? Vector<T>{} : y;
     return given > most ? Vector<T>{} + INFINITY : y;
   } else {
     for (int64_t i = 0; i < LANES<T>; ++i) x[i] = std::exp(x[i]);

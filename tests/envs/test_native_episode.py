@@ -134,14 +134,19 @@ def test_a_body_that_breaks_starts_again_while_the_others_go_on(at_once: int, mo
 
 
 @pytest.mark.parametrize("body", [HopperMorph, HalfCheetahMorph])
-def test_every_warning_of_mujoco_breaks_a_body_also_one_that_it_gave_before(body: type[MorphEnv]) -> None:
+def test_every_warning_of_mujoco_breaks_a_body_also_one_that_it_gave_before_and_writes_nothing(
+    body: type[MorphEnv], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Bodies that start with a hundred times what physics can bear, which MuJoCo puts back by itself."""
+    monkeypatch.chdir(tmp_path)
     make = lambda: body(num_runs=3, seed=0, episode_steps=STEPS, reset_noise=100.0)  # noqa: E731
     design = torch.ones(3, body.DESIGN_SIZE)
     rows, again = natively_and_replayed(make, make_policy(make(), num_cells=(8,)), design)
     assert rows["next", "terminated"].sum(0).max() > 1
     for key in ROW_KEYS:
         assert torch.equal(rows[key], again[key]), key
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("limit", [1.3, 2.0])
@@ -194,6 +199,33 @@ def test_an_action_that_is_not_finite_is_refused_as_in_python(weight: float) -> 
         run_episode(env, policy, native=True)
     assert (env.simulations.qpos[1] == start.simulations.qpos[1]).all()
     assert (env.num_broken == 0).all()
+
+
+def test_a_weight_that_is_not_finite_is_found_also_behind_a_unit_that_is_zero() -> None:
+    env = HopperMorph(num_runs=2, seed=0, episode_steps=5)
+    policy = make_policy(env, num_cells=(8,))
+    with torch.no_grad():
+        first, last = policy.network.mlp.layers
+        first.bias[3] = -1e3
+        last.weight[3] = torch.nan
+    for native in (False, True):
+        with pytest.raises(ValueError, match=r"nan.* is not finite; the policy that gave it has diverged"):
+            run_episode(env, policy, native=native)
+
+
+@pytest.mark.parametrize("order", ["bias first", "one more"])
+def test_weights_are_read_by_name(order: str) -> None:
+    one, other = (HopperMorph(num_runs=2, seed=0, episode_steps=5) for _ in range(2))
+    policy = make_policy(one, num_cells=(8,))
+    expected = run_episode(one, policy, rng=rng(), native=True)
+    layer = policy.network.mlp.layers[0]
+    if order == "bias first":
+        weight = layer.weight
+        del layer.weight
+        layer.weight = weight
+    else:
+        layer.register_parameter("more", torch.nn.Parameter(torch.zeros(3)))
+    assert (run_episode(other, policy, rng=rng(), native=True) == expected).all()
 
 
 @pytest.mark.parametrize("lies", ["in a flat buffer", "transposed"])
@@ -310,15 +342,20 @@ def test_code_is_made_once_for_all_processes_and_anew_if_it_is_damaged(
     (made,) = tmp_path.rglob("*.so")
     library.__wrapped__()
     assert len(compiled()) == 1
-    # Elsewhere, since a process loads no second library of the same path.
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "other"))
-    damaged = tmp_path / "other" / made.relative_to(tmp_path)
-    damaged.parent.mkdir(parents=True)
-    damaged.write_bytes(made.read_bytes()[:100])
-    library.__wrapped__()
-    assert len(compiled()) == 2
-    assert list((tmp_path / "other").rglob("*.so")) == [damaged]
-    assert damaged.stat().st_size == made.stat().st_size
+    whole, seal = made.read_bytes(), made.with_suffix(".sha256")
+    half = len(whole) // 2
+    for damage in (whole[:100], whole[:half], whole[:half] + bytes(len(whole) - half)):  # loaded, the last two kill
+        # Elsewhere each time, since a process loads no second library of the same path.
+        elsewhere = tmp_path / f"other {len(runs)}"
+        monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(elsewhere))
+        damaged = elsewhere / made.relative_to(tmp_path)
+        damaged.parent.mkdir(parents=True)
+        damaged.write_bytes(damage)
+        (damaged.parent / seal.name).write_text(seal.read_text())
+        library.__wrapped__()
+        assert damaged.read_bytes() == whole
+        assert {*elsewhere.rglob("*.*")} == {damaged, damaged.parent / seal.name}
+    assert len(compiled()) == 4
 
 
 def test_without_a_compiler_or_with_one_that_fails_a_sentence_says_so(

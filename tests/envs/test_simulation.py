@@ -55,6 +55,28 @@ def test_building_changes_only_the_rows_that_are_named():
     assert simulations.qpos.tolist() == [[0.5]] * 4
 
 
+def test_a_body_that_the_fleet_cannot_have_leaves_it_as_it_was() -> None:
+    def with_a_hand(spec: mujoco.MjSpec, design: np.ndarray) -> None:
+        lengthen(spec, design)
+        if design[0] > 2:
+            hand = spec.body("pole").add_body(name="hand", pos=[0, 0, -1])
+            hand.add_joint(name="wrist", axis=[0, 1, 0])
+            hand.add_geom(name="hand", size=[0.1, 0, 0])
+
+    simulations, other = fleet(), fleet()
+    simulations._shape_body = with_a_hand
+    before = [simulations.model(k) for k in range(4)]
+    with pytest.raises(
+        ValueError,
+        match=r"designs \[\[1.1\], \[2.1\]\] has other parts .*model 1 does not give mjData the batch model's layout",
+    ):
+        simulations.build(np.array([0, 1]), np.array([[1.1], [2.1]]))
+    assert [simulations.model(k) is before[k] for k in range(4)] == [True] * 4
+    for one in (simulations, other):
+        assert one.step(50).size == 0
+    np.testing.assert_array_equal(simulations.state, other.state)
+
+
 @pytest.mark.parametrize("velocity", [np.nan, np.inf, 1e12, 2e6])
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_a_row_that_breaks_is_named_and_starts_again_and_no_other_row_notices(velocity, num_threads):

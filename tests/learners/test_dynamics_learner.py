@@ -62,6 +62,16 @@ def test_updates_equal_the_loss_and_adam(make_rows: Rows, predict: str, dtype: t
     assert_equal_weights(ensemble, expected, dtype)
 
 
+def test_native_updates_take_rows_of_other_numbers(make_rows: Rows) -> None:
+    rows = make_rows(20, 32, dtype=torch.float32)
+    ensembles = [ensemble_on(make_rows(20, 32), dtype=torch.float64, predict="delta") for _ in range(2)]
+    native, plain = (DynamicsLearner(one, compile=compile) for one, compile in zip(ensembles, (True, False)))
+    losses = [one.update(rows)["loss_dynamics"].double() for one in (native, plain)]
+    torch.testing.assert_close(*losses, rtol=1e-6, atol=0)
+    assert (native.native, plain.native) == (True, False)
+    assert_equal_weights(*ensembles, torch.float32)  # of what the rows were rounded to
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("predict", ["delta", "next"])
 def test_each_run_of_a_fleet_learns_what_it_would_learn_alone(

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
+from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 from coim.learners.captured import FlatAdam
 
@@ -59,3 +60,19 @@ def test_hooks_are_called_and_schedulers_see_the_step() -> None:
         scheduler.step()  # warns, which is an error here, if it has seen no step
         assert optimiser.param_groups[0]["lr"] == 5e-4
     assert called == ["before", "after"] * 2
+
+
+def test_hooks_of_all_optimisers_are_seen() -> None:
+    _, ours = pair()
+    assert isinstance(ours, FlatAdam)
+    assert ours.is_plain()
+    for register in (
+        register_optimizer_step_pre_hook,
+        register_optimizer_step_post_hook,
+    ):
+        hook = register(lambda *_: None)
+        try:
+            assert not ours.is_plain()
+        finally:
+            hook.remove()
+    assert ours.is_plain()

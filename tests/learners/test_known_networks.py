@@ -70,6 +70,14 @@ def other_distribution(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
     return policy, qvalue
 
 
+def bias_before_weight(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
+    layer = qvalue.module.mlp.layers[1]
+    weight = layer.weight
+    del layer.weight
+    layer.weight = weight
+    return policy, qvalue
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -82,6 +90,7 @@ def other_distribution(policy: Policy, qvalue: QValue) -> tuple[Policy, QValue]:
             frozen_layer,
             r"trains all weights, and module.0.module.mlp.layers.0.weight of the Policy has requires_grad=Fal",
         ),
+        (bias_before_weight, "registered in this order, and module.mlp.layers.1 has bias, weight in the QValue; train"),
         (other_distribution, r"a TanhNormal on \[-1, 1\], not of TanhNormal with {'low': -2.0, 'high': 2.0}"),
     ],
 )

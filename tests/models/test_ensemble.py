@@ -133,6 +133,19 @@ def test_sampling_without_gradients_draws_the_same(monkeypatch, make_rows, runs,
     torch.testing.assert_close(sampled, expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("num_rows", [9, 3_000])
+def test_samples_under_autocast_are_those_without_it_to_its_precision(make_rows, num_rows):
+    rows = make_rows(num_rows, dtype=torch.float32)
+    ensemble = ensemble_on(rows).float()
+    given = {"members": torch.randint(3, (num_rows,)), "noise": torch.randn(num_rows, 3)}
+    with torch.no_grad():
+        expected = ensemble.sample(*inputs(rows), **given)
+        with torch.autocast("cpu", torch.bfloat16):
+            sampled = ensemble.sample(*inputs(rows), **given)
+    assert sampled.dtype == torch.float32
+    torch.testing.assert_close(sampled, expected, rtol=0.05, atol=0.05)
+
+
 @pytest.mark.parametrize("runs", [None, 2])
 @pytest.mark.parametrize("grad", [True, False])
 def test_samples_are_of_the_network_as_it_is_called(make_rows, runs, grad):

@@ -120,11 +120,12 @@ def test_gradients_and_loss_of_a_member_equal_the_written_out_ones(
         torch.testing.assert_close(own, other, rtol=EXACT[dtype], atol=EXACT[dtype])
 
 
-@pytest.mark.parametrize("number", [-1e30, -200.0, -90.0, -20.0, 20.0, 90.0, 200.0, 1e30, -torch.inf, torch.inf])
+@pytest.mark.parametrize("number", [-1e30, -800.0, -90.0, -20.0, 20.0, 90.0, 800.0, 1e30, -torch.inf, torch.inf])
+@pytest.mark.parametrize("dtype", EXACT)
 @pytest.mark.parametrize("of", ["a sum before SiLU", "a log-variance", "an error"])
-def test_numbers_far_outside_give_what_they_give_written_out(of: str, number: float) -> None:
+def test_numbers_far_outside_give_what_they_give_written_out(of: str, number: float, dtype: torch.dtype) -> None:
     """Where an exponential is zero or infinite, and what follows from it."""
-    member = Member(MEMBERS[2], torch.float32)
+    member = Member(MEMBERS[2], dtype)
     if of == "an error":
         member.target[0, 0] = number
     else:
@@ -133,6 +134,18 @@ def test_numbers_far_outside_give_what_they_give_written_out(of: str, number: fl
         # The roundings of a sum go by its summands.
         largest = float(other.nan_to_num(0, 0, 0).abs().amax().clamp(min=1))
         torch.testing.assert_close(own, other, rtol=2e-4, atol=2e-4 * largest, equal_nan=True)
+
+
+@pytest.mark.parametrize("bound", CLAMPED)
+def test_a_log_scale_at_its_bound_is_still_within(bound: float) -> None:
+    case = Case(SIZES[2])
+    acted = case.batch.action.shape[-1]
+    case.policy.weights[-1][:, acted] = 0.0
+    case.policy.biases[-1][acted] = bound
+    gradients, expected = case.found()[0], case.expected().policy
+    assert float(expected[-1][acted].abs()) > 0
+    for own, other in zip(gradients, expected):
+        torch.testing.assert_close(own, other, rtol=1e-11, atol=1e-11)
 
 
 def test_critics_that_say_the_same_share_the_gradient_of_the_policy() -> None:
@@ -233,6 +246,7 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
 def test_wide_layers_are_left_to_the_libraries() -> None:
     assert pays([torch.zeros(1000, 256), torch.zeros(256)])
     assert not pays([torch.zeros(10, 257), torch.zeros(257)])
+    assert not pays([torch.zeros(10, 16, dtype=torch.bfloat16), torch.zeros(16, dtype=torch.bfloat16)])
 
 
 def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -307,6 +321,30 @@ def test_a_changed_header_is_compiled_anew(tmp_path: Path, monkeypatch: pytest.M
     for number in (7, 8):
         header.write_text(f"#define NUMBER {number}\n")
         assert source.library().number() == number
+
+
+def test_each_processor_compiler_option_and_version_has_code_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder may serve several machines, whose compilers predefine what their processors can do."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    path, compiler = tmp_path / "source.cpp", tmp_path / "c++"
+    path.write_text('extern "C" int number() { return MACHINE; }\n')
+    source = Source(path=path, options=("-O1",), purpose="numbers", way_out="guess")
+
+    def number_on(machine: int, source: Source) -> int:
+        compiler.write_text(f'#!/bin/sh\nexec {find_compiler("")} -DMACHINE={machine} "$@"\n')
+        compiler.chmod(0o755)
+        with monkeypatch.context() as patch:
+            patch.setenv("CXX", str(compiler))
+            return source.library().number()
+
+    assert [number_on(machine, source) for machine in (1, 2, 1)] == [1, 2, 1]
+    assert len([*tmp_path.rglob("*.so")]) == 2
+    for other in (replace(source, options=("-O2",)), replace(source, made_from="MuJoCo 4")):
+        before = len([*tmp_path.rglob("*.so")])
+        assert number_on(1, other) == 1
+        assert len([*tmp_path.rglob("*.so")]) == before + 1
 
 
 def test_every_header_that_is_included_is_named() -> None:

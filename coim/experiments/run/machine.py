@@ -38,14 +38,15 @@ def checked_device(name: str) -> torch.device:
     return device
 
 
-def check_compiler(without: str = "--no-compile --no-native-episodes") -> None:
+def check_compiler(without: str = "--no-compile --no-native-episodes", *, makes: bool = True) -> None:
     """Refuse to compile where it cannot work, before anything is written.
 
     Args:
         without: options that do without, for the message.
+        makes: whether something will be made for certain, in place of taking what an earlier process has made.
 
     Raises:
-        ValueError: if there is no C++ compiler, or what it makes could not be loaded from where it is put.
+        ValueError: if there is no C++ compiler, or what it makes could not be put there or not be loaded from there.
     """
     try:
         find_compiler(without)
@@ -54,7 +55,7 @@ def check_compiler(without: str = "--no-compile --no-native-episodes") -> None:
     folder = folder_of_compiled_code()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     noexec = hasattr(os, "ST_NOEXEC") and os.statvfs(there).f_flag & os.ST_NOEXEC
-    if noexec or not os.access(there, os.W_OK):
+    if noexec or (makes and not os.access(there, os.W_OK)):
         why = "is mounted noexec" if noexec else "cannot be written to"
         raise ValueError(
             f"compiled code is put into {folder} and loaded from there, which {why}; name another folder by the "

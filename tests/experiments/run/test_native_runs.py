@@ -11,6 +11,36 @@ import pytest
 from tiny_runs import run_by_options
 
 from coim.envs.native_episode import library
+from coim.experiments.run.machine import check_compiler
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--compile"], "native gradients,"),
+        (["--compile", "--num-cells", "257"], "native gradients of the model,"),
+        (["--compile", "--model-cells", "257"], "native gradients of policy and critics,"),
+        (["--compile", "--num-cells", "257", "--imagine", "none"], "not compiled,"),
+        (["--compile", "--num-cells", "257", "--dream", "simulator"], "not compiled,"),
+        ([], "not compiled,"),
+    ],
+)
+@pytest.mark.usefixtures("undrawn")
+def test_a_run_says_which_gradients_are_native(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_by_options(tmp_path / "run", "--no-quiet", *options)
+    first = capsys.readouterr().out.splitlines()[0]
+    assert f" thread, {said} " in first or f" each, {said} " in first
+
+
+def test_code_that_an_earlier_process_made_serves_from_a_folder_that_cannot_be_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coim.experiments.run.machine.os.access", lambda path, mode: mode != os.W_OK)
+    check_compiler(makes=False)
+    with pytest.raises(ValueError, match="cannot be written to; name another folder by the environment variable TORCH"):
+        check_compiler()
 
 
 @pytest.fixture
