@@ -62,8 +62,8 @@ class UpdatePlan:
             individual networks too, Sec. 5 gives imagined rows to the population alone; 0 follows Sec. 5.
 
     Raises:
-        ValueError: if a count is no whole number or below its least value. When `rows` are asked for: if a share is
-            outside [0, 1] or of less than a row.
+        ValueError: if a count is no whole number or below its least value, or a share outside [0, 1]. When `rows` are
+            asked for: if a share is of less than a row, or shares together leave no row of the learner's own.
 
     Example:
         >>> plan = UpdatePlan()
@@ -82,6 +82,9 @@ class UpdatePlan:
     def __post_init__(self) -> None:
         names = ("individual_updates", "population_updates", "model_updates")
         check_counts({"batch_size": self.batch_size}, {name: getattr(self, name) for name in names})
+        for name in ("imagined_share", "individual_mix", "individual_imagined_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, it must lie in [0, 1]")
 
     def without_imagination(self) -> UpdatePlan:
         """The same plan for the model-free baseline."""

@@ -45,3 +45,10 @@ def test_metrics_bear_the_names_of_their_learners() -> None:
 def test_a_number_of_updates_that_cannot_be_is_named(count: float) -> None:
     with pytest.raises(ValueError, match="population_updates is"):
         UpdatePlan(population_updates=count)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["imagined_share", "individual_mix", "individual_imagined_share"])
+@pytest.mark.parametrize("share", [-0.1, 2.0, float("nan")])
+def test_a_share_that_cannot_be_is_named(name: str, share: float) -> None:
+    with pytest.raises(ValueError, match=rf"{name} is {share}, it must lie in \[0, 1\]"):
+        UpdatePlan(**{name: share})

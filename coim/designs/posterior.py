@@ -162,6 +162,10 @@ class DesignPosterior:
 
         The design in the unit cube; the order of building, from 0 to 1; the prior's value, standardised.
         """
+        if designs.dim() != 2:
+            raise ValueError(
+                f"designs of shape {list(designs.shape)} must be [P, {len(self._low)}]; a single one is design[None]"
+            )
         order = torch.ones(len(designs), 1, dtype=torch.float64, device="cpu")
         return self._inputs(designs, self._values(designs), order)
 

@@ -43,9 +43,13 @@ def evaluate(fitness: Fitness, designs: Tensor) -> Tensor:
     """Call a fitness and check its result, ``[P, D] -> [P]``.
 
     Raises:
-        ValueError: if it returns another shape, or a value that is not finite.
+        ValueError: if it returns no tensor, another shape, or a value that is not finite.
     """
     values = fitness(designs)
+    if not isinstance(values, Tensor):
+        raise ValueError(
+            f"the fitness returned a {type(values).__name__}; return a tensor [P], as by torch.from_numpy(values)"
+        )
     if values.shape != designs.shape[:1]:
         raise ValueError(
             f"the fitness of {len(designs)} designs has shape {list(values.shape)}, [{len(designs)}] is needed: "

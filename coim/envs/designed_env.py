@@ -104,7 +104,7 @@ def check_reset(given: TensorDictBase | None, readable: tuple[str, ...], design_
 
 
 def check_reward(reward: RewardFn, observation: Tensor, action: Tensor, design: Tensor, *, name: str) -> None:
-    """Check the shape and the dtype of a reward function by calling it.
+    """Check what a reward function returns by calling it.
 
     Args:
         reward: ``(observation, action, next_observation, design) -> [*B, 1]``.
@@ -119,6 +119,8 @@ def check_reward(reward: RewardFn, observation: Tensor, action: Tensor, design: 
     # Rewards of a whole episode are computed at once, with one more batch dimension.
     here, torques, body = (value.expand(2, *value.shape) for value in (observation, action, design))
     found, wanted = reward(here, torques, here.clone(), body), [*here.shape[:-1], 1]
+    if not isinstance(found, Tensor):
+        raise ValueError(f"the reward of {name} is a {type(found).__name__}; return a tensor {wanted}")
     if list(found.shape) != wanted or found.dtype != here.dtype:
         raise ValueError(
             f"the reward of {name} has shape {list(found.shape)} and dtype {found.dtype} for observations "

@@ -136,7 +136,7 @@ def _pairs(
 
 def _first_designs(pairs: tuple[tuple[float, float], ...]) -> tuple[tuple[float, ...], ...]:
     """Return the robot as drawn and fixed draws from the uniform distribution, to two digits behind the point."""
-    low, high = np.array(pairs).T
+    low, high = np.sort(pairs, axis=1).T  # a pair the wrong way round is refused with all other bounds
     drawn = np.random.default_rng(0).uniform(low, high, (OTHERS, len(pairs))).round(2).clip(low, high)
     return ((1.0,) * len(pairs), *(tuple(row) for row in drawn.tolist()))
 

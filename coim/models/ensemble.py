@@ -236,7 +236,7 @@ class GaussianEnsemble(TensorDictModuleBase):
         if noise is None:
             noise = torch.randn(observation.shape, generator=generator, device=source, dtype=observation.dtype)
             noise = noise.to(device)
-        inputs = self.inputs(torch.cat([observation, action, design], -1))
+        inputs = self._inputs(observation, action, design)
         mean, log_var = self._grouped(inputs, members).chunk(2, -1)
         target = mean + (self._bounded(log_var) / 2).exp() * noise
         target = target * self.targets.std.to(target.dtype) + self.targets.mean.to(target.dtype)
@@ -278,8 +278,18 @@ class GaussianEnsemble(TensorDictModuleBase):
         source = device if generator is None else generator.device
         return torch.randint(self.num_members, batch, generator=generator, device=source).to(device)
 
+    def _inputs(self, observation: Tensor, action: Tensor, design: Tensor) -> Tensor:
+        """What the network reads, ``[*B, (K,) F]``; refuse inputs of another body."""
+        found = [part.shape[-1] for part in (observation, action, design)]
+        if sum(found) != self.network.in_features or found[0] != len(self.is_angle):
+            raise ValueError(
+                f"observation, action and design have {found} numbers, this model reads {self.network.in_features} and "
+                f"{len(self.is_angle)} of them observed; make it for this body by GaussianEnsemble.for_env"
+            )
+        return self.inputs(torch.cat([observation, action, design], -1))
+
     def _predict(self, observation: Tensor, action: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_var = self.network(self.inputs(torch.cat([observation, action, design], -1))).chunk(2, -1)
+        mean, log_var = self.network(self._inputs(observation, action, design)).chunk(2, -1)
         return mean, self._bounded(log_var)
 
     def _bounded(self, log_var: Tensor) -> Tensor:

@@ -73,7 +73,17 @@ class InputScaling(nn.Module):
         return cls(scale, low, high, bounded=bounded)
 
     def forward(self, observation: Tensor, design: Tensor) -> tuple[Tensor, Tensor]:
-        """Scale observation and design, ``[*B, S]`` and ``[*B, D]``."""
+        """Scale observation and design, ``[*B, S]`` and ``[*B, D]``.
+
+        Raises:
+            ValueError: if they have other sizes, as those of another body.
+        """
+        sizes = (len(self.observation_scale), len(self.design_centre))
+        if (found := (observation.shape[-1], design.shape[-1])) != sizes:
+            raise ValueError(
+                f"observation and design have {found[0]} and {found[1]} numbers, this network was made for a body with "
+                f"{sizes[0]} and {sizes[1]}; make it by make_policy or make_qvalue for this body"
+            )
         return observation / self.observation_scale, self.scaled_design(design)
 
     def scaled_design(self, design: Tensor) -> Tensor:

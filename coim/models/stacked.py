@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from itertools import pairwise
+from numbers import Integral
 from typing import TypeVar, cast
 
 import torch
@@ -100,7 +101,7 @@ class StackedMLP(nn.Module):
         layers: the :class:`StackedLinear` layers in order, hidden ones first.
 
     Raises:
-        ValueError: if a size is below one.
+        ValueError: if a size is no whole number, or below one.
 
     Example:
         >>> critics = StackedMLP(5, 1, [200, 200, 200], num_copies=2)
@@ -126,8 +127,8 @@ class StackedMLP(nn.Module):
         super().__init__()
         sizes = [in_features, *num_cells, out_features]
         self.stack = tuple(n for n in (num_runs, num_copies) if n is not None)
-        if min(*sizes, *self.stack) < 1:
-            raise ValueError(f"layer sizes {sizes} and stack {self.stack} must all be at least 1")
+        if not all(isinstance(size, Integral) and size >= 1 for size in (*sizes, *self.stack)):
+            raise ValueError(f"layer sizes {sizes} and stack {self.stack} must all be whole numbers of at least 1")
         self.in_features, self.out_features = in_features, out_features
         self.num_runs, self.num_copies = num_runs, num_copies
         self.activation = activation(inplace=True)

@@ -298,7 +298,7 @@ class CoImSACLoss(LossModule):
             rows = rows if importance is None else rows * importance.to(rows.dtype)
             return rows if self.reduction == "none" else rows.sum()
         imagined = tensordict.get(self.tensor_keys.imagined, None)
-        imagined = torch.zeros_like(rows, dtype=torch.bool) if imagined is None else imagined.reshape(rows.shape)
+        imagined = torch.zeros_like(rows, dtype=torch.bool) if imagined is None else imagined.reshape(rows.shape).bool()
         importance = None if importance is None else split_runs(importance, self.num_runs)
         rows, imagined = split_runs(rows, self.num_runs), split_runs(imagined, self.num_runs)
         return (mixing_weights(imagined, self.mix, importance=importance, dtype=rows.dtype) * rows).sum()

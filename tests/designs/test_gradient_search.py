@@ -132,6 +132,8 @@ def test_values_and_gradients_that_are_not_finite_are_named() -> None:
 
     with pytest.raises(ValueError, match=r"nan for the design \[.*1 of 64 designs"):
         GradientSearch(SPEC).maximise(broken_value)
+    with pytest.raises(ValueError, match=r"the fitness returned a ndarray; return a tensor \[P\], as by torch"):
+        GradientSearch(SPEC).maximise(lambda designs: designs.detach().numpy().sum(-1))
     with pytest.raises(ValueError, match=r"gradient of the fitness is not finite at \[.* 64 designs in all"):
         GradientSearch(SPEC).maximise(lambda x: (x - x.detach()).sqrt().sum(-1))
 

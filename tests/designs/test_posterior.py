@@ -192,6 +192,12 @@ def test_what_cannot_be_fitted_is_refused(
         DesignPosterior(SPEC, designs, returns, **arguments)
 
 
+def test_a_single_design_needs_a_dimension_of_its_own() -> None:
+    posterior = DesignPosterior(SPEC, built(4), torch.arange(4.0))
+    with pytest.raises(ValueError, match=r"designs of shape \[2\] must be \[P, 2\]; a single one is design\[None\]"):
+        posterior.predict(torch.ones(2))
+
+
 def test_without_botorch_everything_else_works_and_the_posterior_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules.update(botorch=None, gpytorch=None, linear_operator=None)\n"

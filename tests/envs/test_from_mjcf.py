@@ -249,6 +249,8 @@ def test_a_file_that_is_not_there_and_bounds_that_leave_an_entry_out_are_refused
         morph_from_mjcf("nowhere.xml", {"upper": ["upper"]}, slow)
     with pytest.raises(ValueError, match=r"bounds are those of \['lower'\], and a design has \['upper'\]; give a pair"):
         morph_from_mjcf(arm_file, {"upper": ["upper"]}, slow, bounds={"lower": (0.5, 2.0)})
+    with pytest.raises(ValueError, match=r"BOUNDS is \(\(2, 0.5\),\); .* each low < high, with 1 between them"):
+        morph_from_mjcf(arm_file, {"upper": ["upper"]}, slow, bounds=(2, 0.5))
     camera = morph_from_mjcf(arm_file, {"upper": ["upper"]}, slow, camera="below")
     with pytest.raises(ValueError, match=r"CAMERA is 'below', and the file has the cameras \['above'\]"):
         camera().camera()

@@ -118,6 +118,16 @@ def test_a_mesh_that_could_touch_the_floor_is_named() -> None:
         read_root(model, "Hopper")
 
 
+def test_a_reward_that_is_no_tensor_is_refused() -> None:
+    class Paid(HopperMorph):
+        @staticmethod
+        def reward(*given: Tensor, task: str = "forward") -> float:  # type: ignore[override]
+            return 1.0
+
+    with pytest.raises(ValueError, match=r"the reward of Paid is a float; return a tensor \[2, 3, 1\]"):
+        Paid(num_runs=3)
+
+
 def test_a_body_without_motors_is_named() -> None:
     spec = mujoco.MjSpec.from_file(str(HOPPER))
     for motor in list(spec.actuators):

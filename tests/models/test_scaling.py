@@ -190,6 +190,8 @@ def test_bad_scales_and_networks_that_disagree_are_refused() -> None:
     with pytest.raises(ValueError, match="must leave a range"):
         InputScaling(one, one, one)
     env = HopperMorph(seed=0)
+    with pytest.raises(ValueError, match="have 11 and 4 numbers, this network was made for a body with 18 and 7; make"):
+        env.rollout(2, make_policy(WalkerMorph(seed=0), num_cells=(8,)))
     qvalue = make_qvalue(env, num_cells=(8,))
     qvalue.module.scaling.observation_scale[0] = 7.0
     with pytest.raises(ValueError, match="scale their inputs differently"):

@@ -131,6 +131,8 @@ def test_bad_input_is_named():
         StackedMLP(5, 1, [7], num_runs=3)(torch.zeros(4, 5))
     with pytest.raises(ValueError, match="at least 1"):
         StackedMLP(5, 1, [7], num_copies=0)
+    with pytest.raises(ValueError, match=r"layer sizes \[5, 7, 1\] and stack \(2.5,\) must all be whole numbers"):
+        StackedMLP(5, 1, [7], num_copies=2.5)
     with pytest.raises(ValueError, match="has no run axis"):
         select_run(StackedMLP(5, 1, [7]), 0)
     with pytest.raises(IndexError, match=r"run 3 is outside 0 \.\. 2"):

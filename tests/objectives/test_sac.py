@@ -155,6 +155,18 @@ def test_imagined_rows_count_once(policy, qvalue, make_rows, mix, weights):
         torch.testing.assert_close(out[key], (weights * per_row).sum(), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("mix", ["batch", "sum"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64, torch.uint8], ids=str)
+def test_marks_of_imagined_rows_may_be_numbers(policy, qvalue, make_rows, mix, dtype):
+    rows = make_rows(40)
+    rows["imagined"], rows["weight"] = torch.arange(40).unsqueeze(1) >= 30, torch.rand(40, 1)
+    losses = []
+    for marks in (rows["imagined"], rows["imagined"].to(dtype)):
+        torch.manual_seed(0)
+        losses.append(build(policy, qvalue, mix=mix)(rows.clone().set("imagined", marks)))
+    assert all(torch.equal(losses[0][name], losses[1][name]) for name in ("loss_actor", "loss_qvalue"))
+
+
 @pytest.mark.parametrize("imagined", [None, False, True])
 def test_with_one_kind_of_row_both_mixes_agree(policy, qvalue, make_rows, imagined):
     rows = with_noise(make_rows(50))

@@ -38,7 +38,8 @@ class Evaluate:
     body: str | None = None
     """Class of the body as module:Class, if it is not one of ours."""
     out: Path | None = None
-    """The CSV file; by default evaluation.csv in the run's folder, or beside the policy."""
+    """The CSV file; by default evaluation.csv in the run's folder, or beside the policy, or evaluation-2.csv, ... where
+    there is one already."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -52,10 +53,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"reading {asked.source}", file=sys.stderr, flush=True)  # imports take seconds
         from coim.experiments.export.evaluation import EVALUATION, evaluate, told, write_table
         from coim.experiments.export.taken import take
+        from coim.experiments.run.atomic_write import new_file
 
         taken = take(asked.source, asked.design, run=asked.run, policy=asked.policy, body=asked.body)
         table = evaluate(taken, episodes=asked.episodes, seed=asked.seed)
         folder = asked.source if asked.source.is_dir() else asked.source.parent
-        path = asked.out or folder / EVALUATION.file
+        path = asked.out or new_file(folder / EVALUATION.file)
         write_table(table, path)
         print("\n".join([*told(taken, table), str(path)]), flush=True)

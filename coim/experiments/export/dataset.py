@@ -43,7 +43,10 @@ def write_dataset(folder: Path, name: str, *, run: int | None, body: str | None)
             not installed.
     """
     minari = needed("h5py", "minari", otherwise="")
-    minari.dataset.minari_dataset.parse_dataset_id(name)  # refuses it before a folder of that name is made
+    try:
+        minari.dataset.minari_dataset.parse_dataset_id(name)  # refuses it before a folder of that name is made
+    except TypeError as error:
+        raise ValueError(f"{name!r} has no version; take a name such as coim/hopper/first-v0") from error
     loaded = opened(folder, body, run=run)
     rows = replay_of(folder)
     runs = range(rows["action"].shape[1]) if run is None else [run]

@@ -76,7 +76,7 @@ def told(taken: Taken, table: pd.DataFrame) -> list[str]:
     ]
     if taken.tried is not None:
         best = number(taken.tried.best_return)
-        lines.append(f"its best evaluation in the run had {best}: the highest of several, so above their mean")
+        lines.append(f"its best evaluation in the run, the highest if there were several, had {best}")
     if broken := int(table["broken"].sum()):
         lines.append(f"the simulation broke {broken} times and began again; see the column broken")
     return lines

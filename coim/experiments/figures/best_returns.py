@@ -32,8 +32,8 @@ CAPTION = (
 NOTES = (
     "The best return of a design is the highest undiscounted return of the deterministic policy over the evaluation "
     "episodes on it.",
-    "The first designs are given. After them, designs that maximise Q and random designs take turns, unless the arm "
-    "says otherwise.",
+    "The first designs are given. After them, designs that a search has chosen, by Eq. 5 unless the arm says "
+    "otherwise, and random designs take turns.",
     "A mean is over the runs that have reached the design. Its interval is a percentile bootstrap within environment, "
     f"task and arm ({RESAMPLES} resamples).",
 )

@@ -150,10 +150,11 @@ def room_for_names(arms: Sequence[str]) -> float:
 
 
 def pairs(runs: Runs, measured: pd.DataFrame) -> Plot:
-    """Probability of improvement of every pair of arms that is compared, with the tests as a table."""
+    """Probability of improvement of each arm over its baselines, with the tests as a table."""
     rows = rows_of(comparisons(runs, measured))
     if not rows:
-        return missing("statistics_pairs", "No two arms have runs that are over.", runs.in_words(runs.arms))
+        why = "No two arms that are compared, an arm and a baseline of it, have runs that are over."
+        return missing("statistics_pairs", why, runs.in_words(runs.arms))
     labels = list(dict.fromkeys(map(label_of, rows)))[::-1]  # the first on top
     there = [name for name in COMPARED if any(row["measure"] == name for row in rows)]
     figure, grid = new_figure(0.9 + 0.26 * max(4, len(labels)), 1, len(there))

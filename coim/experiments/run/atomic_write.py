@@ -82,16 +82,20 @@ def written_aside(path: Path) -> Iterator[Path]:
 
 
 def dated_file(kind: str, suffix: str) -> Path:
-    """Make an empty file ``runs/KIND-DATE`` that nobody else has, with ``-2``, ``-3``, ... where another was quicker.
+    """Make an empty file ``runs/KIND-DATE`` that nobody else has, as `new_file` does."""
+    return new_file(Path("runs") / f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}{suffix}")
+
+
+def new_file(wanted: Path) -> Path:
+    """Make an empty file that nobody else has: the wanted one, with ``-2``, ``-3``, ... where there is one already.
 
     Raises:
         OSError: if it cannot be made.
     """
-    stem, folder = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}", Path("runs")
-    with naming_out(folder):
-        folder.mkdir(exist_ok=True)
+    with naming_out(wanted.parent):
+        wanted.parent.mkdir(exist_ok=True)
         for i in itertools.count(1):
-            path = folder / f"{stem}{f'-{i}' if i > 1 else ''}{suffix}"
+            path = wanted.with_stem(f"{wanted.stem}-{i}") if i > 1 else wanted
             with suppress(FileExistsError):
                 path.touch(exist_ok=False)
                 break

@@ -178,7 +178,7 @@ def first_designs(body: type[MorphEnv], settings: Settings) -> Sequence[Sequence
         fleet = settings.num_runs > 1
         each = f", or {size * settings.num_runs} for a design of each of {settings.num_runs} runs" if fleet else ""
         raise ValueError(
-            f"first_design has {len(asked)} number(s), a design of this body has {size}; give {size}{each}"
+            f"--first-design has {len(asked)} number(s), a design of this body has {size}; give {size}{each}"
         )
     if len(asked) > size and len(asked) == size * settings.num_runs:
         return [[list(asked[i : i + size]) for i in range(0, len(asked), size)]]

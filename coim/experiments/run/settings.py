@@ -175,6 +175,8 @@ class Settings:
     """Print errors only."""
 
     def __post_init__(self) -> None:  # errors have the names of settings in backticks, for `pydantic_errors.sentence`
+        if "/" in self.name:
+            raise ValueError(f"`name` is {self.name!r}, the end of a folder's name; leave out the /, or give --out")
         if self.widening and self.reach is None:
             raise ValueError(
                 f"`widening` is {self.widening} without a `reach` that it could widen; give one, such as 0.25"

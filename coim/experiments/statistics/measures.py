@@ -129,7 +129,7 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
 
 
 def comparisons(runs: Runs, measured: pd.DataFrame) -> pd.DataFrame:
-    """Compare every pair of arms by every measure, in each environment and task and, where there are several, over all.
+    """Compare every arm with its baselines by every measure, in each environment and task and over all of them.
 
     Holm's correction is over all tests of one measure in the study.
 

@@ -329,7 +329,12 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def pairs_of_arms(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Pairs of an arm and one of its baselines, as far as both are among these names."""
-    return [
-        (name, baseline) for baseline in ARMS if baseline in names for name in names if baseline in ARMS[name].baselines
-    ]
+    """Pairs of an arm and each of its baselines among these names; if none is there, of the baselines of those."""
+    found = {name: _baselines_among(name, names) for name in names}
+    return [(name, baseline) for baseline in ARMS for name in names if baseline in found[name]]
+
+
+def _baselines_among(name: str, names: Sequence[str]) -> set[str]:
+    baselines = ARMS[name].baselines
+    here = {baseline for baseline in baselines if baseline in names}
+    return here or {far for baseline in baselines for far in _baselines_among(baseline, names)}

@@ -62,15 +62,22 @@ def test_a_missing_package_is_said(fleet: Path, monkeypatch: pytest.MonkeyPatch)
         main([str(fleet), "--name", "first-v0"])
 
 
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("bad name", "Malformed dataset ID: bad name"),
+        ("bad", "'bad' has no version; take a name such as coim/hop"),
+    ],
+)
 def test_a_name_that_minari_refuses_leaves_no_folder(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, sentence: str
 ) -> None:
     pytest.importorskip("minari")
     pytest.importorskip("h5py")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
-    with pytest.raises(SystemExit, match="Malformed dataset ID: bad name"):
-        main([str(fleet), "--name", "bad name"])
-    assert not list(tmp_path.rglob("bad name"))
+    with pytest.raises(SystemExit, match=sentence):
+        main([str(fleet), "--name", name])
+    assert not list(tmp_path.rglob(name))
 
 
 def test_damaged_rows_are_no_dataset(fleet: Path, tmp_path: Path) -> None:

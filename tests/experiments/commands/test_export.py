@@ -137,6 +137,10 @@ def test_lengths_that_are_no_design_have_the_populations_policy(fleet: Path, cap
     assert lines[0].startswith("body 1,2,0.5,1, the population's policy: return ")
     assert lines[1] == str(fleet / "evaluation.csv")
     (row,) = rows_in(fleet / "evaluation.csv")
+    again = evaluated(capsys, str(fleet), "--episodes", "1", "--design", "best")
+    assert again[1].startswith("its best evaluation in the run, the highest if there were several, had ")
+    assert again[2] == str(fleet / "evaluation-2.csv")
+    assert rows_in(fleet / "evaluation.csv") == [row]
     assert (row["policy"], row["run"]) == ("population", str(load_run(fleet).best.tried.run))
     assert (row["xi_thigh"], row["xi_shank"]) == ("2.0", "0.5")
 
@@ -226,5 +230,5 @@ def test_the_populations_policy_is_not_told_the_best_return_of_another(
     own, population = (
         evaluated(capsys, str(fleet), "--episodes", "1", "--policy", policy) for policy in ("best", "population")
     )
-    assert any("its best evaluation in the run had" in line for line in own)
-    assert not any("its best evaluation in the run had" in line for line in population)
+    assert any("its best evaluation in the run, the highest" in line for line in own)
+    assert not any("its best evaluation in the run, the highest" in line for line in population)

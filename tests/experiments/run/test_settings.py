@@ -46,6 +46,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("checkpoint_every", 0, "checkpoint_every is 0, it must be at least 1"),
     ("num_designs", 0, "num_designs is 0, it must be at least 1"),
     ("first_design", (1, -1), "first_design has -1, each must be above 0"),
+    ("name", "a/b", "name is 'a/b', the end of a folder's name; leave out the /, or give --out"),
     ("sigma", -1, "sigma is -1, it must be at least 0"),
     ("dream", "simulator", "dream simulator imagines nothing with imagine none; take known, noisy or random"),
 ]

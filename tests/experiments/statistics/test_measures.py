@@ -197,6 +197,16 @@ def test_every_arm_meets_the_baseline_and_each_way_to_imagine_the_one_that_it_ch
     ]
 
 
+def test_an_arm_whose_baselines_were_left_out_meets_the_baselines_of_these() -> None:
+    assert pairs_of_arms(["none", "grounded-known"]) == [("grounded-known", "none")]
+    assert pairs_of_arms(["returns", "grounded-governed", "grounded-known"]) == [
+        ("grounded-governed", "returns"),
+        ("grounded-known", "returns"),
+        ("grounded-governed", "grounded-known"),
+    ]
+    assert pairs_of_arms(["grounded-known", "control-only"]) == []
+
+
 def test_the_detectable_difference_is_found_in_four_of_five_studies() -> None:
     rng = np.random.default_rng(0)
     x, y = np.array([1.0, 2.0, 6.0, 4.0, 3.0]), np.array([10.0, 30.0, 20.0])
