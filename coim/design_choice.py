@@ -287,8 +287,13 @@ def _check_first_designs(spec: Bounded, first_designs: Tensor) -> None:
             f"first_designs are {first_designs.dtype} on {first_designs.device}, the bodies take {spec.dtype} on "
             f"{low.device}; move them by first_designs.to({str(low.device)!r}, {spec.dtype})"
         )
-    if not ((low <= first_designs) & (first_designs <= high)).all():
-        raise ValueError(f"a first design of {first_designs.tolist()} leaves [{low.tolist()}, {high.tolist()}]")
+    within = (low <= first_designs) & (first_designs <= high)
+    if not within.all():
+        *_, entry = (~within).nonzero()[0].tolist()
+        raise ValueError(
+            f"a first design has {first_designs[~within][0].item():g} as its entry {entry + 1} of {len(low)}, which "
+            f"must lie in [{low[entry]:g}, {high[entry]:g}]"
+        )
 
 
 def _check_search(spec: Bounded, search: DesignSearch | None) -> None:

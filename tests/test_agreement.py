@@ -234,7 +234,11 @@ REFUSED: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
         r"the search looks among designs of .*3\.0, 3\.0\]",
     ),
     "no first design": (lambda: {"first_designs": torch.ones(0, 4)}, "with at least one row"),
-    "a first design of NaN": (lambda: {"first_designs": torch.full((1, 4), torch.nan)}, "a first design of .* leaves"),
+    "a first design of NaN": (lambda: {"first_designs": torch.full((1, 4), torch.nan)}, r"has nan as its entry 1 of 4"),
+    "a first design beyond the bounds": (
+        lambda: {"first_designs": torch.tensor([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 9.0, 1.0]])},
+        r"a first design has 9 as its entry 3 of 4, which must lie in \[0.5, 2\]",
+    ),
     "double first designs": (
         lambda: {"first_designs": torch.ones(1, 4, dtype=torch.float64)},
         "are torch.float64 on cpu, the bodies take torch.float32",
