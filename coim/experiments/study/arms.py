@@ -28,11 +28,12 @@ from coim.experiments.drawing.palette import (
 )
 from coim.experiments.run.settings import METHODS
 
-Family = Literal["imagination", "bodies", "grounded"]
+Family = Literal["imagination", "bodies", "grounded", "returns"]
 FAMILIES: dict[Family, str] = {
     "imagination": "arms that differ in what they imagine",
     "bodies": "arms that differ in how they choose the next body",
     "grounded": "arms that choose bodies as `grounded` does and differ in what they imagine",
+    "returns": "arms that choose bodies as `returns` does and differ in what they imagine",
 }
 
 
@@ -303,6 +304,24 @@ ARMS = by_name(
         family="grounded",
         colour=GREY,
         marker="o",
+    ),
+    Arm(
+        name="returns-known",
+        words="chooses bodies as returns does and imagines the designs tried so far",
+        settings={"imagine": "known", **METHODS["returns"]},
+        baselines=("returns",),
+        family="returns",
+        colour=BLUE,
+        marker="<",
+    ),
+    Arm(
+        name="returns-noisy",
+        words="chooses bodies as returns does and imagines the designs tried so far with noise added",
+        settings={"imagine": "noisy", **METHODS["returns"]},
+        baselines=("returns", "returns-known"),
+        family="returns",
+        colour=ORANGE,
+        marker=">",
     ),
 )
 

@@ -7,7 +7,7 @@ from coim.experiments.study.definition import Block, Study
 SEEDS = tuple(range(10))
 # A method is developed on the first seeds and confirmed on the others, by which nothing may be chosen.
 DEVELOP, CONFIRM, FLEET = tuple(range(5)), tuple(range(20, 30)), tuple(range(30, 40))
-REACH, OTHERS = tuple(range(40, 50)), tuple(range(50, 60))
+REACH, OTHERS, AGAIN = tuple(range(40, 50)), tuple(range(50, 60)), tuple(range(60, 70))
 
 
 def bodies(name: str, seeds: tuple[int, ...]) -> Study:
@@ -56,6 +56,12 @@ def imagining(name: str, seeds: tuple[int, ...]) -> Study:
     )
 
 
+def imagining_with_returns() -> Study:
+    """Whether imagining the designs tried so far pays where bodies are chosen as `returns` does."""
+    robots, arms = ("hopper", "half_cheetah"), ("returns", "returns-known", "returns-noisy")
+    return Study(name="imagining-returns", environments=robots, arms=arms, seeds=AGAIN, protocol="pilot")
+
+
 STUDIES = {
     study.name: study
     for study in (
@@ -89,6 +95,7 @@ STUDIES = {
         bodies_in_fleets(),
         imagining("imagining-develop", DEVELOP),
         imagining("imagining", CONFIRM),
+        imagining_with_returns(),
         Study(
             name="smoke",
             environments=("hopper",),

@@ -177,10 +177,14 @@ def test_a_method_is_confirmed_by_the_study_it_was_developed_on_with_other_seeds
     assert counts == [7 * 5, 7 * 10, (8 + 3) * 5, (8 + 3) * 10]
 
 
-def test_an_arm_that_imagines_with_grounded_bodies_differs_from_its_namesake_in_the_choice_alone() -> None:
-    choice = METHODS["grounded"]
-    for imagine in ("known", "noisy", "random"):
-        assert ARMS[f"grounded-{imagine}"].settings == ARMS[imagine].settings | choice
+@pytest.mark.parametrize(
+    ("method", "imagined"), [("grounded", ("known", "noisy", "random")), ("returns", ("known", "noisy"))]
+)
+def test_an_arm_that_imagines_with_other_bodies_differs_from_its_namesake_in_the_choice_alone(
+    method: str, imagined: tuple[str, ...]
+) -> None:
+    for imagine in imagined:
+        assert ARMS[f"{method}-{imagine}"].settings == ARMS[imagine].settings | METHODS[method]
 
 
 def test_the_ledger_keeps_what_is_finished_and_lets_all_else_wait(tmp_path: Path) -> None:
