@@ -63,7 +63,7 @@ class UpdatePlan:
 
     Raises:
         ValueError: if a count is no whole number or below its least value, or a share outside [0, 1]. When `rows` are
-            asked for: if a share is of less than a row, or shares together leave no row of the learner's own.
+            asked for: if a share is of less than a row, or those of a batch are more than all of it.
 
     Example:
         >>> plan = UpdatePlan()

@@ -96,10 +96,11 @@ def train(
     threads = settings.threads or available_cores()
     side_by_side = prepare(threads, checked_device(settings.device))
     products = begin_or_resume(name, settings)
-    if needing := [name for name in ("compile", "native_episodes") if getattr(settings, name)]:
-        without = " ".join(option(f"no_{name}") for name in needing)
-        check_compiler(without, makes=settings.compile and not has_native_gradients(settings))
-    check_native_code(gradients=has_native_gradients(settings), episodes=settings.native_episodes)
+    native, traced = has_native_gradients(settings), settings.compile and torch.device(settings.device).type != "cpu"
+    needed = {"compile": native or traced, "native_episodes": settings.native_episodes}
+    if needing := [option(f"no_{name}") for name, asked in needed.items() if asked]:
+        check_compiler(" ".join(needing), makes=traced)
+    check_native_code(gradients=native, episodes=settings.native_episodes)
     check_logger(settings.log)
     with folder_of(name, settings) as folder:
         algorithm = make(folder, threads, side_by_side)

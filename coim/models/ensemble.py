@@ -283,8 +283,8 @@ class GaussianEnsemble(TensorDictModuleBase):
         found = [part.shape[-1] for part in (observation, action, design)]
         if sum(found) != self.network.in_features or found[0] != len(self.is_angle):
             raise ValueError(
-                f"observation, action and design have {found} numbers, this model reads {self.network.in_features} and "
-                f"{len(self.is_angle)} of them observed; make it for this body by GaussianEnsemble.for_env"
+                f"observation, action and design have {found} numbers, this model reads {self.network.in_features}, of "
+                f"which {len(self.is_angle)} are observed; make it for this body by GaussianEnsemble.for_env"
             )
         return self.inputs(torch.cat([observation, action, design], -1))
 

@@ -269,7 +269,7 @@ def test_bad_input_is_named(make_rows):
     with pytest.raises(ValueError, match=r"angle indices \[3\] must lie in 0 \.\. 2"):
         GaussianEnsemble(3, 2, 2, angle_indices=(3,))
     for read in (GaussianEnsemble(4, 2, 1).sample, GaussianEnsemble(3, 2, 3).moments):
-        with pytest.raises(ValueError, match=r"have \[3, 2, 2\] numbers, this model reads . and . of them observed"):
+        with pytest.raises(ValueError, match=r"have \[3, 2, 2\] numbers, this model reads ., of which . are observed"):
             read(*inputs(make_rows(4)))
     with pytest.raises(IndexError, match=r"members must lie in 0 \.\. 2"):
         ensemble_on(make_rows(4)).sample(*inputs(make_rows(4)), members=torch.full((4,), 3))

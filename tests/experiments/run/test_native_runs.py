@@ -37,10 +37,21 @@ def test_a_run_says_which_gradients_are_native(
 def test_code_that_an_earlier_process_made_serves_from_a_folder_that_cannot_be_written_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    run_by_options(tmp_path / "first", "--compile", "--native-episodes")
     monkeypatch.setattr("coim.experiments.run.machine.os.access", lambda path, mode: mode != os.W_OK)
-    check_compiler(makes=False)
     with pytest.raises(ValueError, match="cannot be written to; name another folder by the environment variable TORCH"):
         check_compiler()
+    run_by_options(tmp_path / "second", "--compile", "--native-episodes")
+    assert (tmp_path / "second" / "designs.csv").exists()
+
+
+def test_where_nothing_is_compiled_no_compiler_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    run_by_options(tmp_path / "run", "--compile", "--num-cells", "257", "--imagine", "none")
+    with pytest.raises(
+        SystemExit, match=r"no C\+\+ compiler \(no-such-compiler\) was found; install one, or --no-compile"
+    ):
+        run_by_options(tmp_path / "other", "--compile", "--num-cells", "257")  # whose model is narrow
 
 
 @pytest.fixture
