@@ -194,7 +194,7 @@ def test_a_caller_can_stop_at_any_event() -> None:
         ({"imagined_share": 1.2}, r"share is 1.2, it must lie in \[0, 1\]"),
         ({"individual_mix": 0.7, "individual_imagined_share": 0.6}, "need 13"),
         ({"first_designs": torch.ones(2, 3)}, r"first_designs has shape \[2, 3\], expected \[I, 4\]"),
-        ({"first_designs": torch.full((1, 4), 3.0)}, "leaves"),
+        ({"first_designs": torch.full((1, 4), 3.0)}, r"has 3 as its entry 1 of 4, which must lie in \[0.5, 2\]"),
         ({"bodies": "serach"}, "bodies='serach' is unknown; choose 'search', 'random' or 'fixed'"),
     ],
 )
