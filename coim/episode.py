@@ -18,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from coim.envs.designed_env import check_rewards
 from coim.envs.fleet import Fleet
 from coim.envs.morph import MorphEnv
 from coim.envs.native_episode import Actor, Rows, play
@@ -59,7 +60,7 @@ def run_episode(
 
     Raises:
         TypeError: if ``env`` is no `MorphEnv`, such as a TransformedEnv.
-        ValueError: if the design leaves its bounds (see `MorphEnv.reset`), or an action is not finite.
+        ValueError: if the design leaves its bounds (see `MorphEnv.reset`), or an action or a reward is not finite.
         RuntimeError: if native code is asked for and cannot be compiled.
 
     Example:
@@ -106,6 +107,7 @@ def run_episode(
                 observation = env.reset(again)["observation"].cpu()
     designs = design.expand(steps, *design.shape)
     rewards = env.reward(observations, actions, following, designs, env.task)
+    check_rewards(rewards, design, name=type(env).__name__)
     truncated = torch.zeros_like(broken)
     truncated[-1] = True
     episode = TensorDict(

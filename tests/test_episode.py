@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from copy import deepcopy
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.collectors import RandomPolicy
 from torchrl.envs import ExplorationType, ObservationNorm, TransformedEnv, set_exploration_type
 
@@ -174,6 +175,29 @@ def test_the_rewards_of_an_episode_are_those_of_its_steps_to_the_last_bit(task: 
     env.reset()
     rewards = torch.stack([env.advance(action)[1] for action in rows["action"]])
     assert torch.equal(rows["next", "reward"], rewards)
+
+
+class Limping(HopperMorph):
+    """Is paid the root of its speed along, which a step backwards does not have."""
+
+    @staticmethod
+    def reward(
+        observation: Tensor, action: Tensor, next_observation: Tensor, design: Tensor, task: str = "forward"
+    ) -> Tensor:
+        return next_observation[..., 5, None].sqrt()
+
+
+def test_a_reward_that_is_no_number_is_told_with_its_step_and_its_body() -> None:
+    env, plain = (body(num_runs=2, episode_steps=30, seed=0) for body in (Limping, HopperMorph))
+    thin, rng = torch.tensor([[1.0] * 4, [1.0, 1.0, 1.0, 0.5]]), torch.Generator()
+    rows = run_episode(plain, None, design=thin, rng=rng.manual_seed(0))
+    step, row = (rows["next", "observation"][..., 5] < 0).nonzero()[0].tolist()
+    sentence = f"the reward of Limping is nan at step {step} for the body {thin[row].tolist()}, although"
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        run_episode(env, None, design=thin, rng=rng.manual_seed(0))
+    env.reset()
+    with pytest.raises(ValueError, match=r"the reward of Limping is nan for the body .* give reward"):
+        list(map(env.advance, rows["action"]))
 
 
 def test_a_transformed_environment_is_refused_by_name() -> None:

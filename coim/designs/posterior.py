@@ -55,6 +55,7 @@ SIGNAL = 1.0
 NOISE = 0.9
 SPREAD = 0.3
 
+ROUNDING = 1e-4  # of the width of the bounds, by which designs that went through a file or a transform may leave them
 LEAST_RETURNS = 3  # with two, every straight line through both is as good as another
 
 
@@ -83,9 +84,9 @@ class DesignPosterior:
 
     Raises:
         ImportError: when the module is imported and BoTorch is not installed.
-        ValueError: if designs and returns do not belong together, a design is not finite, fewer than three returns
-            are finite or all of these are equal, ``prior`` gives values that are not finite, or ``optimism`` is
-            negative.
+        ValueError: if designs and returns do not belong together, a design is not finite or beyond the bounds, fewer
+            than three returns are finite or all of these are equal, ``prior`` gives values that are not finite, or
+            ``optimism`` is negative.
 
     Note:
         Nothing is drawn: the same data give the same bits on the same machine.  Length scale, signal, noise, a, b and
@@ -116,7 +117,7 @@ class DesignPosterior:
         if not 0 <= optimism < math.inf:
             raise ValueError(f"optimism is {optimism}, it must be 0 or more: deviations above the mean")
         self._low, self._high = bounds_of(spec)
-        _check(designs, returns, self._low)
+        _check(designs, returns, self._low, self._high)
         self.prior, self.optimism = prior, optimism
         self._num_built = len(returns)
         known = returns.isfinite()
@@ -254,7 +255,7 @@ def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
     return model.requires_grad_(False).eval()
 
 
-def _check(designs: Tensor, returns: Tensor, low: Tensor) -> None:
+def _check(designs: Tensor, returns: Tensor, low: Tensor, high: Tensor) -> None:
     if designs.dim() != 2 or designs.shape[-1] != len(low) or returns.shape != designs.shape[:1]:
         raise ValueError(
             f"designs {list(designs.shape)} and returns {list(returns.shape)} do not belong together; "
@@ -262,6 +263,14 @@ def _check(designs: Tensor, returns: Tensor, low: Tensor) -> None:
         )
     if not designs.isfinite().all():
         raise ValueError(f"design {int((~designs.isfinite()).any(-1).nonzero()[0])} has an entry that is not finite")
+    place = in_unit_cube(designs, *bounds_for(designs, low, high))
+    beyond = (place < -ROUNDING) | (place > 1 + ROUNDING)
+    if beyond.any():
+        body, entry = beyond.nonzero()[0].tolist()
+        raise ValueError(
+            f"design {body} has {designs[body, entry].item():g} as its entry {entry}, which must lie in "
+            f"[{low[entry]:g}, {high[entry]:g}]; pass designs as they were built, and the spec of these bodies"
+        )
     known = returns[returns.isfinite()]
     if len(known) < LEAST_RETURNS:
         raise ValueError(

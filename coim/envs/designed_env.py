@@ -5,6 +5,7 @@ Shapes: ``*B`` batch of the environment, S observation, D design, A action.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, MutableMapping
 from typing import Any
 
@@ -126,4 +127,28 @@ def check_reward(reward: RewardFn, observation: Tensor, action: Tensor, design: 
             f"the reward of {name} has shape {list(found.shape)} and dtype {found.dtype} for observations "
             f"{list(here.shape)}, not {wanted} and {here.dtype}: it is [*B, 1], so keep the last axis, as in "
             "next_observation[..., 5, None]"
+        )
+
+
+def check_rewards(rewards: Tensor, design: Tensor, *, name: str) -> None:
+    """Refuse what a reward function gave for steps that were simulated, if it is not finite.
+
+    A learner would only find that its networks have diverged, and not why.
+
+    Args:
+        rewards: ``[*T, K, 1]``, of one step or of all steps of an episode.
+        design: ``[K, D]``, the bodies.
+        name: name of the environment, for the message.
+
+    Raises:
+        ValueError: that names the first such reward, its step and its body.
+    """
+    if math.isfinite(rewards.sum()):
+        return
+    if (broken := ~rewards.isfinite()).any():
+        *step, row, _ = broken.nonzero()[0].tolist()
+        when = f" at step {step[0]}" if step else ""
+        raise ValueError(
+            f"the reward of {name} is {rewards[broken][0].item()}{when} for the body {design[row].tolist()}, although "
+            "all observations and actions are finite; give reward() a value for this state"
         )

@@ -23,7 +23,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
-from coim.envs.designed_env import DesignedEnv, check_reset, check_reward, check_step, idle_rows, leave_idle
+from coim.envs.designed_env import (
+    DesignedEnv,
+    check_reset,
+    check_reward,
+    check_rewards,
+    check_step,
+    idle_rows,
+    leave_idle,
+)
 from coim.envs.fleet import Fleet
 from coim.envs.task import Task, speed_along
 
@@ -173,10 +181,12 @@ class MorphEnv(Fleet, DesignedEnv):
 
         Raises:
             ValueError: if the action has another shape, or a number that is not finite; the bodies have not moved then.
+                If a reward is not finite; they have moved.
         """
         before = self._observation
         observation, terminated = self.move(action)
         reward = self.reward(before, action.detach().cpu(), self._observation, self._design, self.task)
+        check_rewards(reward, self._design, name=type(self).__name__)
         return observation, reward.to(action.device), terminated
 
     def __getstate__(self) -> dict[str, Any]:

@@ -181,6 +181,8 @@ def test_dtypes_are_those_of_the_candidates_and_the_critic_is_asked_on_them() ->
         (built(4), torch.ones(3), {}, r"designs \[4, 2\] and returns \[3\] do not belong together; pass \[N, 2\]"),
         (built(4, entries=3), torch.arange(4.0), {}, r"designs \[4, 3\] .* pass \[N, 2\]"),
         (built(3).fill_diagonal_(math.nan), torch.arange(3.0), {}, "design 0 has an entry that is not finite"),
+        (built(3) + HIGH, torch.arange(3.0), {}, rf"design 0 has .* as its entry 0, .* in \[{LOW:g}, {HIGH:g}\]; pass"),
+        (built(3) * 0, torch.arange(3.0), {}, "design 0 has 0 as its entry 0"),
         (built(3), torch.arange(3.0), {"optimism": -1.0}, "optimism is -1.0"),
         (built(3), torch.arange(3.0), {"prior": lambda x: x[:, 0] * math.nan}, "the fitness is nan"),
     ],
@@ -239,6 +241,12 @@ def test_an_entry_may_be_held_fixed() -> None:
     assert all(part.isfinite().all() for part in posterior.predict(designs))
     near, _ = TrustRegion(spec, GradientSearch(spec, seed=0), reach=0.2).maximise(bowl, centre=torch.tensor([1.1, 1.2]))
     assert near.tolist() == pytest.approx([1.0, 1.2], abs=0.01)
+
+
+def test_designs_that_a_transform_has_rounded_beyond_the_bounds_are_fitted() -> None:
+    designs = built(6)
+    designs[0, 0], designs[1, 1] = HIGH * (1 + 1e-6), LOW * (1 - 1e-6)
+    assert DesignPosterior(SPEC, designs, returns_of(designs))(designs).isfinite().all()
 
 
 def test_numbers_stay_on_the_cpu_under_another_default_device() -> None:
