@@ -22,6 +22,7 @@ FILES = (
     "tests/objectives/test_gradients.py",
     "tests/objectives/test_dynamics_gradients.py",
     "tests/objectives/test_design.py",
+    "tests/learners/test_native_sac_learner.py",
     "tests/learners/test_sac_learner.py",
     "tests/learners/test_dynamics_learner.py",
     "tests/experiments/run/test_choice_of_products.py",

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from toy_env import ToyEnv
 
 from coim import DynamicsLearner, GaussianEnsemble, SACLearner, make_policy, make_qvalue
 
 # A learning rate that is exact in float32, in which a CUDA graph reads it.
 LR = 0.5**12
+
+Rows = Callable[..., TensorDict]  # the fixture make_rows
 
 
 def sac_learner(
@@ -53,3 +56,8 @@ def give_noise(learner: SACLearner, noise: Sequence[torch.Tensor]) -> None:
     """Let a learner take this noise instead of its own draws: first that of the states, then of the next states."""
     drawn = iter(noise)
     learner._noise = lambda action: next(drawn)  # type: ignore[method-assign]
+
+
+def weights(learner: SACLearner) -> dict[str, torch.Tensor]:
+    """All weights and targets of a learner, as they are now."""
+    return {key: value.clone() for key, value in learner.loss.state_dict().items()}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
+from tiny_runs import run_by_options
 
 
 @pytest.fixture
@@ -46,3 +47,16 @@ def cluster() -> Iterator:
     with ray_running(io.StringIO(), address=nodes.address):
         yield nodes
     nodes.shutdown()
+
+
+@pytest.fixture(scope="session")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished tiny runs: "one", "fleet" of three and "free", a fleet of two without imagination."""
+    from coim.experiments.report.run_report import write_report
+
+    folder = tmp_path_factory.mktemp("runs")
+    options = {"one": [], "fleet": ["--num-runs", "3"], "free": ["--num-runs", "2", "--imagine", "none"]}
+    for name, more in options.items():
+        run_by_options(folder / name, "--quiet", *more, page=name == "one")
+        write_report([folder / name])
+    return folder

@@ -20,7 +20,7 @@ from coim.experiments.report.run_report import write_report
 from coim.experiments.report.summary_png import draw_run
 from coim.experiments.run.records import read_record
 from coim.run_folder import DESIGNS, EVALUATIONS, METRICS
-from tests.experiments.report.test_report import check
+from tests.experiments.report.report_page import check
 
 FLEET = {"num_runs": 3, "imagine": "noisy"}
 
