@@ -16,8 +16,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from coim.envs.fleet import uniform_and_normal
 from coim.envs.morph import MorphEnv
+from coim.envs.robot import uniform_and_normal
 from coim.envs.task import Task, speed_along
 
 HEIGHT, FORWARD_VELOCITY = 0, 13  # entries of the observation

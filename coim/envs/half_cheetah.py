@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coim.envs.fleet import uniform_and_normal
 from coim.envs.morph import MorphEnv
+from coim.envs.robot import uniform_and_normal
 from coim.envs.task import Task, speed_along
 
 LEGS = (("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot"))

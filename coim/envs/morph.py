@@ -41,7 +41,7 @@ DONE_KEYS = ("done", "terminated", "truncated")
 class MorphEnv(Fleet, DesignedEnv):
     """A fleet of robots; a design vector sets their bodies at reset.
 
-    A new body is a subclass: an XML file, the constants of :class:`~coim.envs.fleet.Fleet`, what scales (``SCALE``, or
+    A new body is a subclass: an XML file, the constants of :class:`~coim.envs.robot.Robot`, what scales (``SCALE``, or
     :meth:`shape_body`) and :meth:`reward`; :func:`~coim.morph_from_mjcf` makes one without a class statement. The robot
     runs in the plane of x and z, moves freely, or stands on a fixed base (see `coim.envs.root`); its actuators are
     motors, and an action of -1 or 1 is an end of a motor's ``ctrlrange``.
@@ -198,7 +198,7 @@ class MorphEnv(Fleet, DesignedEnv):
     def __setstate__(self, state: dict[str, Any]) -> None:
         simulation_state = state.pop("simulation_state")
         super().__setstate__(state)
-        self.simulations = self._simulate()
+        self.simulations = self._simulate(self._design.numpy(), self._num_threads)
         self._seed_rows(0)  # makes the generators; set_simulation_state restores their states
         self.set_simulation_state(simulation_state)
 
