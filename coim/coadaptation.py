@@ -222,7 +222,7 @@ class CoAdaptation:
             index=self.position.index,
             kind=trial.kind,
             episode=trial.next_episode,
-            design=design,
+            design=design.clone(),
             training_return=blank(episode_return(rows), place),
             evaluation_return=blank(episode_return(evaluation), place),
             env_steps=self.position.env_steps,

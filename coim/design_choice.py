@@ -140,7 +140,7 @@ class DesignChoice:
         if reach is not None:
             check_reach(reach)
         check_widening(widening, reach)
-        self.spec, self.first_designs, self.search, self.bodies = spec, first_designs, search, bodies
+        self.spec, self.first_designs, self.search, self.bodies = spec, first_designs.clone(), search, bodies
         self.num_start_states, self.value_states, self.value_over = num_start_states, value_states, value_over
         self.precision, self.reach, self.widening = precision, reach, widening
         # On the CPU wherever the networks are: there the same seed gives the same bodies.
@@ -154,14 +154,14 @@ class DesignChoice:
         kind, predicted = self._kind(situation.index), None
         if kind == "optimised":
             found = [self.maximise(situation, run, objective) for run, objective in enumerate(objectives)]
-            design = torch.stack([design for design, _ in found])
+            design = torch.stack([self._checked(design) for design, _ in found])
             if objectives is values:
                 predicted = torch.tensor([value for _, value in found], dtype=torch.float32, device="cpu")
         elif kind == "random":
             design = self.explore(situation)
         else:
             index = 0 if kind == "fixed" else situation.index
-            design = self.first_designs[index].expand(situation.num_runs, -1)
+            design = self.first_designs[index].expand(situation.num_runs, -1).clone()
         if predicted is None and values:
             each = [value(row.unsqueeze(0))[0] for value, row in zip(values, design)]
             predicted = torch.stack(each).cpu()
@@ -209,6 +209,20 @@ class DesignChoice:
         best = situation.tried[int(returns.argmax())].design[run]
         reach = min(1.0, self.reach + self.widening * max(0, situation.index - len(self.first_designs)))
         return TrustRegion(self.spec, self.search, reach=reach).maximise(objective, centre=best)
+
+    def _checked(self, found: Tensor) -> Tensor:
+        """What a search has found, as the bodies take it; refuse what they cannot have."""
+        low, high = self.spec.space.low, self.spec.space.high
+        if not isinstance(found, Tensor) or found.shape != low.shape:
+            shape = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
+            raise ValueError(f"the search has found {shape}; it must return one design [{len(low)}] and its value")
+        design = found.detach().to(low)
+        if not bool(((low <= design) & (design <= high)).all()):
+            raise ValueError(
+                f"the search has found {found.tolist()}, which leaves [{low.tolist()}, {high.tolist()}]; let it end "
+                "with spec.project()"
+            )
+        return design
 
     def expect(self, objectives: list[Fitness], design: Tensor) -> tuple[Tensor, Tensor] | None:
         """Mean and deviation of the best return that is expected of designs ``[K, D]``, each ``[K]`` on the CPU.

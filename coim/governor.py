@@ -80,9 +80,16 @@ class Governor:
         Args:
             error: of `coim.DynamicsLearner.error`, before the model has learnt from these rows, ``[K]``.
             first: whether it is the first episode of a body.
+
+        Raises:
+            ValueError: if there is not one error for each run.
         """
+        if error.shape != self._state["latest"].shape:
+            raise ValueError(
+                f"the errors have shape {list(error.shape)}, the ensemble {len(self._state['latest'])} runs; pass [K]"
+            )
         for name in ("first", "latest") if first else ("latest",):
-            self._state[name] = error.detach().float().cpu()
+            self._state[name] = error.detach().float().cpu().clone()
 
     @torch.no_grad()
     def agreeing(self, imagined: TensorDictBase, real: TensorDictBase) -> TensorDictBase:

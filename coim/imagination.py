@@ -15,10 +15,12 @@ from typing import Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coim.designs import DesignGenerator
 from coim.envs.world_model import WorldModelEnv
+from coim.objectives.runs import check_runs_last
 from coim.pairs import StatesAre, impossible_pairs, stand_ins
 from coim.randomness import drawing_from
 
@@ -69,7 +71,7 @@ def imagine(
 
     Raises:
         ValueError: if there are no states, an entry is missing, an option is unknown, no pair of a run is possible, or
-            the model predicts a number that is not finite.
+            a number that is not finite comes out: of the generator, the policy, the model or the reward.
         TypeError: if states are to be matched and the dream's bodies have no ``transfer``, or rows are to be anchored
             and its model has no ``means``.
 
@@ -93,6 +95,10 @@ def imagine(
     if missing or not states.batch_size.numel():
         lack = f"lack {sorted(missing, key=str)}" if missing else f"have batch size {list(states.batch_size)}"
         raise ValueError(f"the states to imagine from {lack}; sample rows of Replay_Pop")
+    if states.batch_dims > 2:
+        raise ValueError(f"the states to imagine from have batch size {list(states.batch_size)}; give [N], or [N, K]")
+    if states.batch_dims == 2:
+        check_runs_last(states, states.batch_size[-1])
     device, rows_per_state = states["observation"].device, states.batch_size[1:].numel()
     size = CHUNK_ROWS.get(device.type, MANY_ROWS)
     rows = states.select(*needed)
@@ -113,7 +119,7 @@ def _usable_pairs(
     rng: torch.Generator | None,
 ) -> TensorDictBase:
     """States with what is asked about each, ``("asked", "observation")`` and ``("asked", "design")``."""
-    observation, design = states["observation"], generator(states["design"], rng=rng)
+    observation, design = states["observation"], generator(states["design"].clone(), rng=rng)
     usable = torch.ones(states.batch_size, dtype=torch.bool, device=observation.device)
     if states_are == "matched" and dream.transfer is not None and dream.clearance is not None:
         observation = dream.transfer(observation, states["design"], design)
@@ -139,7 +145,7 @@ def _imagine_chunk(
     if "asked" in states:
         observation, design = states["asked", "observation"], states["asked", "design"]
     else:
-        observation, design = states["observation"], generator(states["design"], rng=rng)
+        observation, design = states["observation"], generator(states["design"].clone(), rng=rng)
     if actions == "fresh":
         asked = TensorDict({"observation": observation, "design": design}, states.batch_size, device=states.device)
         action = policy(asked)["action"]
@@ -149,16 +155,35 @@ def _imagine_chunk(
         next_observation, reward = dream.advance_beside(states, observation, action, design, generator=rng)
     else:
         next_observation, reward = dream.advance(observation, action, design, generator=rng)
-    if not next_observation.isfinite().all():
-        raise ValueError(
-            "the model of the dynamics predicts a next observation that is not finite; train it, or check its weights "
-            "and the states it was given"
-        )
+    _check_finite(observation, design, action, next_observation, reward)
     never = torch.zeros_like(reward, dtype=torch.bool)
     after = {"observation": next_observation, "design": design, "reward": reward}
     after |= {"terminated": never, "truncated": never.clone(), "done": never.clone()}
     row = {"observation": observation, "design": design, "action": action, "next": after}
     return TensorDict(row, states.batch_size, device=states.device)
+
+
+def _check_finite(observation: Tensor, design: Tensor, action: Tensor, following: Tensor, reward: Tensor) -> None:
+    """Refuse numbers that are not finite by the name of what gave them; a learner would find its own to be broken."""
+    if following.isfinite().all() and reward.isfinite().all():
+        return
+    for value, reason in (
+        (observation, "a state to imagine from is not finite; drop such rows of Replay_Pop"),
+        (design, "the generator makes a design that is not finite; let it end with design_spec.project()"),
+        (action, "the policy gives an action that is not finite; it has diverged"),
+        (
+            following,
+            "the model of the dynamics predicts a next observation that is not finite; train it, or check its "
+            "weights and the states it was given",
+        ),
+    ):
+        if not value.isfinite().all():
+            raise ValueError(reason)
+    row = (~reward.isfinite()).nonzero()[0][:-1].unbind()
+    raise ValueError(
+        f"the reward of an imagined step is {reward[row].item()} for the body {design[row].tolist()}, although the "
+        f"state that the model predicts, {following[row].tolist()}, is finite; give reward() a value for this state"
+    )
 
 
 def check_options(dream: WorldModelEnv, states_are: str, actions: str) -> None:

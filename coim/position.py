@@ -9,7 +9,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -57,14 +57,14 @@ class Position:
     def begin(self, chosen: DesignChosen) -> Trial:
         """Start to try a body."""
         best = torch.full(chosen.design.shape[:1], -torch.inf, dtype=torch.float32, device="cpu")
-        self.trial = Trial(chosen.kind, chosen.design, chosen.predicted, best)
+        self.trial = Trial(chosen.kind, chosen.design.clone(), chosen.predicted, best)  # the event is the listener's
         return self.trial
 
     def end(self, trial: Trial, best_return: Tensor, diverged: Mapping[int, Place]) -> DesignDone:
         """Go on behind a body whose episodes are over."""
-        done = DesignDone(self.index, trial.kind, trial.design, best_return, dict(diverged))
+        done = DesignDone(self.index, trial.kind, trial.design.clone(), best_return.clone(), dict(diverged))
         self.index, self.trial = self.index + 1, None
-        self.tried.append(done)
+        self.tried.append(replace(done, design=trial.design, best_return=best_return))
         return done
 
     def state_dict(self) -> dict[str, Any]:

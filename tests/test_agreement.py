@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -35,6 +36,7 @@ from coim import (
     make_qvalue,
 )
 from coim.agreement import check_bodies, check_learners, check_model
+from coim.imagined_replay import _check_rewards
 
 ENV = HopperMorph(num_runs=2, episode_steps=STEPS, seed=0)
 WALKER = WalkerMorph(num_runs=2, seed=0)
@@ -362,3 +364,22 @@ def test_a_fleet_of_one_run_searches_for_its_body() -> None:
         updates=UpdatePlan(individual_updates=1, population_updates=1, batch_size=4),
     )
     assert [event.kind for event in made if isinstance(event, EpisodeDone)] == ["first", "optimised"]
+
+
+class Rooted(HopperMorph):
+    """Is paid the root of its height, which made-up states do not all have."""
+
+    @staticmethod
+    def reward(
+        observation: Tensor, action: Tensor, next_observation: Tensor, design: Tensor, task: str = "forward"
+    ) -> Tensor:
+        sign = 1 if task == "forward" else 2
+        return sign * next_observation[..., :1].sqrt()
+
+
+def test_rewards_that_are_no_number_in_made_up_states_are_compared_in_the_others() -> None:
+    env = Rooted(num_runs=2, seed=0)
+    for task, agrees in (("forward", True), ("backward", False)):
+        dream = WorldModelEnv(ensemble(), Rooted(num_runs=2, seed=0, task=task), batch_size=[2])
+        with nullcontext() if agrees else pytest.raises(ValueError, match="pays other rewards than the bodies"):
+            _check_rewards(env, dream)

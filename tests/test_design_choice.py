@@ -149,3 +149,54 @@ def test_random_designs_have_numbers_of_their_own() -> None:
 def test_a_choice_checks_its_own_settings(settings: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         DesignChoice(SPEC, torch.ones(1, 4), search=ParticleSwarm(SPEC, seed=0), **settings)
+
+
+class Finding:
+    """A search that always finds the same."""
+
+    def __init__(self, found: Any) -> None:
+        self.found = found
+
+    def maximise(self, fitness: Fitness) -> tuple[Any, float]:
+        return self.found, 0.0
+
+
+@pytest.mark.parametrize(
+    ("found", "sentence"),
+    [
+        (torch.ones(1, 4), r"the search has found \[1, 4\]; it must return one design \[4\]"),
+        ([1.0] * 4, "the search has found list"),
+        (torch.full((4,), 2.1), r"the search has found \[2.09.*, which leaves .*project"),
+        (torch.full((4,), torch.nan), r"the search has found \[nan"),
+    ],
+)
+def test_what_a_search_finds_is_checked(found: Any, sentence: str) -> None:
+    choice = DesignChoice(SPEC, torch.ones(1, 4), search=Finding(found), num_start_states=2)
+    with pytest.raises(ValueError, match=sentence):
+        list(small(imagine=False, design_choice=choice, num_designs=2))
+
+
+def test_what_a_search_of_numpy_finds_is_a_design_of_the_bodies() -> None:
+    found = torch.full((4,), 1.3, dtype=torch.float64, requires_grad=True)
+    choice = DesignChoice(SPEC, torch.ones(1, 4), search=Finding(found), num_start_states=2)
+    *_, done = small(imagine=False, design_choice=choice, num_designs=2)
+    assert torch.equal(done.design, torch.full((1, 4), 1.3))
+    assert not done.design.requires_grad
+
+
+def test_who_listens_may_write_over_what_is_told() -> None:
+    first = torch.tensor(HopperMorph.FIRST_DESIGNS[:2])
+    told, written_over = [], []
+    for listener in (told, written_over):
+        given = first.clone()
+        algorithm = small(first_designs=given, num_designs=5)
+        given.fill_(7.0)
+        for event in algorithm:
+            listener.append(event.design.clone())
+            if listener is written_over:
+                event.design.fill_(1.5)
+                if isinstance(event, DesignDone):
+                    event.best_return.neg_()
+        assert torch.equal(algorithm.design_choice.first_designs, first)
+    assert all(map(torch.equal, told, written_over))
+    assert len(told) == len(written_over)

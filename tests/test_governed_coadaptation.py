@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from small_algorithm import small
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from coim import (
@@ -111,6 +112,21 @@ def test_runs_that_earn_it_imagine_and_the_others_are_the_baseline(monkeypatch: 
         assert not same(weights(baseline), weights(governed), slice(run, run + 1))
     shares = [event.metrics["imagined_share"].tolist() for event in events if isinstance(event, EpisodeDone)]
     assert shares == [pytest.approx([0.2, 0.0, 0.125])] * 7
+
+
+def test_what_is_imagined_has_passed_the_governor(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_errors(monkeypatch, 0.1)
+    governed = small(1, **GOVERNED, batch_size=20)
+
+    def marked(imagined: TensorDictBase, real: TensorDictBase) -> TensorDictBase:
+        assert len(real) > 1
+        return imagined.set(("next", "reward"), torch.full_like(imagined["next", "reward"], 7.0))
+
+    assert governed.imagined is not None
+    monkeypatch.setattr(governed.imagined.governor, "agreeing", marked)
+    for event in governed:
+        if isinstance(event, EpisodeDone):
+            assert (governed.buffers.art[:]["next", "reward"] == 7.0).all()
 
 
 def test_batches_have_the_imagined_rows_that_each_run_has_earned(monkeypatch: pytest.MonkeyPatch) -> None:

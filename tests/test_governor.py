@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from coim.governor import AGREED, EARNED, LEAST_SHARE, UNEARNED, Governor
+from coim.governor import EARNED, LEAST_SHARE, UNEARNED, Governor
 from coim.models import GaussianEnsemble
 
 
@@ -80,6 +80,8 @@ def test_rows_on_which_the_members_disagree_more_than_on_real_ones_are_replaced(
     assert len(kept) == 100
     assert (found <= limit).all()
     own = (kept["observation"] == mixed["observation"]).all(-1)
+    agreed = governed.ensemble.disagreement(mixed["observation"], mixed["action"], mixed["design"]) <= limit
+    assert torch.equal(own, agreed)
     assert own[:60].float().mean() > 0.8
     assert not own[60:].any()
 
@@ -92,14 +94,23 @@ def test_a_model_that_is_asked_about_what_it_does_not_know_imagines_nothing() ->
     kept = governed.agreeing(imagined, real)
     assert (kept[:, 1] == imagined[:, 1]).all()
     assert governed.shares(0.2).tolist() == pytest.approx([0.2, 0.0])
-    assert 0 < AGREED < 0.95
 
 
 def test_what_was_measured_is_a_state() -> None:
     one, other = governor(2), governor(2)
     one.observe(torch.tensor([0.1, 0.3]), first=True)
     one.observe(torch.tensor([0.2, 0.2]), first=False)
-    other.load_state_dict(one.state_dict())
+    state = one.state_dict()
+    other.load_state_dict(state)
     assert torch.equal(other.shares(0.2), one.shares(0.2))
-    one.observe(torch.tensor([9.0, 9.0]), first=False)
+    state["latest"].fill_(9.0)
     assert other.earns()
+
+
+def test_what_is_told_is_kept_and_the_teller_may_write_over_it() -> None:
+    governed, error = governor(2), torch.tensor([0.1, 0.1])
+    governed.observe(error, first=True)
+    error.fill_(9.0)
+    assert governed.shares(0.2).tolist() == pytest.approx([0.2, 0.2])
+    with pytest.raises(ValueError, match=r"the errors have shape \[3\], the ensemble 2 runs"):
+        governed.observe(torch.zeros(3), first=True)

@@ -158,6 +158,58 @@ def test_a_model_that_is_not_finite_is_named(broken: float) -> None:
         imagine(as_dream(Dream(broken)), make_states(5), make_policy(), KnownDesigns())
 
 
+def test_what_is_not_finite_is_told_by_who_gave_it() -> None:
+    class Unpaid(Dream):
+        """Pays the root of a negative number."""
+
+        def advance(self, *given: Tensor, **how: torch.Generator | None) -> tuple[Tensor, Tensor]:
+            after, reward = super().advance(*given, **how)
+            return after, (reward - 10).sqrt()
+
+    def broken(design: Tensor, rng: torch.Generator | None = None) -> Tensor:
+        return design * torch.nan
+
+    lost = make_states(5)
+    lost["observation"] = lost["observation"] * torch.nan
+    for dream, states, generator, sentence in (
+        (Unpaid(), make_states(50), KnownDesigns(), r"an imagined step is nan for the body \[1.0, 1.0\], although"),
+        (Dream(), make_states(5), broken, "the generator makes a design that is not finite"),
+        (Dream(), lost, KnownDesigns(), "a state to imagine from is not finite"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            imagine(as_dream(dream), states, make_policy(), generator)
+    diverged = TensorDictModule(
+        lambda observation: observation[..., :1] * torch.nan, in_keys=["observation"], out_keys=["action"]
+    )
+    with pytest.raises(ValueError, match="the policy gives an action that is not finite"):
+        imagine(as_dream(DreamOfActions()), make_states(5), diverged, KnownDesigns())
+
+
+class DreamOfActions(Dream):
+    """Goes where the action points."""
+
+    def advance(
+        self, observation: Tensor, action: Tensor, design: Tensor, *, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        return observation + action, action
+
+
+def test_a_generator_that_works_in_place_changes_no_row() -> None:
+    states = make_states(5)
+    rows = imagine(as_dream(Dream()), states, make_policy(), lambda design, rng=None: design.mul_(1.5))
+    assert (states["design"] == 1.0).all()
+    assert (rows["design"] == 1.5).all()
+
+
+def test_axes_that_would_be_misread_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"have batch size \[4, 3, 2\]; give \[N\], or \[N, K\]"):
+        imagine(as_dream(Dream()), make_states(4, 3, 2), make_policy(), KnownDesigns())
+    rollout = make_states(3, 3)
+    rollout.names = [None, "time"]
+    with pytest.raises(ValueError, match="time is the last dimension of rows"):
+        imagine(as_dream(Dream()), rollout, make_policy(), KnownDesigns())
+
+
 def test_nothing_to_imagine_from_is_named() -> None:
     with pytest.raises(ValueError, match=r"have batch size \[0\]; sample rows of Replay_Pop"):
         imagine(as_dream(Dream()), make_states(0), make_policy(), KnownDesigns())

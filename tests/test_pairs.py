@@ -35,6 +35,11 @@ def test_a_usable_row_stays_and_the_others_take_usable_ones_of_their_run_in_turn
     assert torch.equal(taken[:, 1], stand_ins(usable[:, 1]))
 
 
+def test_all_usable_rows_stand_in_before_one_does_so_again() -> None:
+    usable = torch.tensor([False, True, False, True, False, True, False])
+    assert stand_ins(usable).tolist() == [1, 1, 3, 3, 5, 5, 1]
+
+
 def test_a_run_without_a_usable_row_is_named() -> None:
     with pytest.raises(ValueError, match="none of the 3 rows of a run can be used"):
         stand_ins(torch.tensor([[True, False]] * 3))

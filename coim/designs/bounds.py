@@ -11,18 +11,26 @@ from torchrl.data import Bounded
 
 def bounds_of(spec: Bounded) -> tuple[Tensor, Tensor]:
     """Return the lowest and the highest design of a spec, each ``[D]``."""
-    if not hasattr(spec.space, "low") or len(spec.shape) != 1:
+    space = getattr(spec, "space", None)  # a Composite has none
+    if space is None or not hasattr(space, "low") or len(spec.shape) != 1:
         raise ValueError(f"{spec} is not the bounds of one design; pass env.design_spec, a Bounded of shape [D]")
-    return spec.space.low, spec.space.high
+    low, high = space.low, space.high
+    if not bool(((low <= high) & low.isfinite() & high.isfinite() & (high - low).isfinite()).all()):
+        raise ValueError(
+            f"{low.tolist()} to {high.tolist()} are no bounds of a design: each must be finite, and low <= high"
+        )
+    return low, high
 
 
 def bounds_for(design: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the bounds on the device and in the dtype of ``design``; refuse a design of another length."""
+    """Return the bounds on the device and in the dtype of ``design``; refuse one of another length or whole numbers."""
     if design.shape[-1:] != low.shape:
         raise ValueError(
             f"a design of shape {list(design.shape)} does not have the {len(low)} entries of the design space; "
             f"pass [*B, {len(low)}]"
         )
+    if not design.is_floating_point():  # whose bounds would be rounded to whole numbers
+        raise ValueError(f"a design is {design.dtype}, it must be of floating-point numbers; pass design.float()")
     return low.to(design), high.to(design)
 
 

@@ -79,7 +79,13 @@ class GradientSearch:
         Raises:
             ValueError: if the fitness is not differentiable, returns another shape, or a value or gradient that is not
                 finite.
+            RuntimeError: within ``torch.inference_mode()``.
         """
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError(
+                "GradientSearch needs gradients, which torch.inference_mode() forbids; search under torch.no_grad(), "
+                "or by ParticleSwarm"
+            )
         # Adam moves in the unit cube, where one step means the same for every entry.
         scale = self._high - self._low
         starts = torch.rand(self.num_starts, len(scale), generator=self._rng, dtype=scale.dtype, device="cpu")

@@ -56,6 +56,7 @@ NOISE = 0.9
 SPREAD = 0.3
 
 ROUNDING = 1e-4  # of the width of the bounds, by which designs that went through a file or a transform may leave them
+ROUNDED = 1e-5  # of the largest value of a critic in float32: what differs by less is rounding
 LEAST_RETURNS = 3  # with two, every straight line through both is as good as another
 
 
@@ -75,7 +76,8 @@ class DesignPosterior:
         designs: built so far in the order of building, ``[N, D]``.
         returns: the best return of each, ``[N]``; a NaN marks one that has none and is left out.
         prior: fitness ``[P, D] -> [P]`` that may know which bodies are good, as :class:`~coim.DesignValue`.  None:
-            plain Bayesian optimisation of returns.
+            plain Bayesian optimisation of returns.  It is asked whenever a design is: once its networks have learnt on,
+            a posterior that was fitted before is no longer right, and a new one is due.
         optimism: deviations that the upper confidence bound lies above the mean, at least 0.
 
     Attributes:
@@ -125,9 +127,10 @@ class DesignPosterior:
         self._mean, self._scale = targets.mean(), targets.std()
         with torch.no_grad():
             values = self._values(designs[known])
-            # A prior that is the same everywhere has a slope of 0, whatever it is divided by.
             spread = values.std()
-            self._value_mean, self._value_scale = values.mean(), spread if spread > 0 else torch.ones_like(spread)
+            # Divided by infinity, a prior that is the same everywhere, but for rounding, has no slope.
+            ranks = spread > ROUNDED * values.abs().max()
+            self._value_mean, self._value_scale = values.mean(), torch.where(ranks, spread, torch.inf)
             order = known.nonzero().to("cpu", torch.float64) / self._num_built
             inputs = self._inputs(designs[known], values, order)
         self.model = _fitted(inputs, (targets - self._mean) / self._scale)
@@ -197,7 +200,19 @@ class DesignPosterior:
         """The prior's values ``[P, 1]``; 0 without one."""
         if self.prior is None:
             return torch.zeros(len(designs), 1, dtype=torch.float64, device="cpu")
-        return evaluate(self.prior, designs).to("cpu", torch.float64).unsqueeze(-1)
+        values = evaluate(self.prior, designs)
+        # Without this, a search would climb what the bodies add to the prior, and not the prior.
+        if (
+            torch.is_grad_enabled()
+            and designs.requires_grad
+            and not values.requires_grad
+            and self._value_scale.isfinite()
+        ):
+            raise ValueError(
+                "the prior is not differentiable in the designs (was it computed under torch.no_grad, or in numpy?); a "
+                "search without gradients, such as ParticleSwarm, takes it"
+            )
+        return values.to("cpu", torch.float64).unsqueeze(-1)
 
     def _inputs(self, designs: Tensor, values: Tensor, order: Tensor) -> Tensor:
         low, high = bounds_for(designs, self._low, self._high)
@@ -263,8 +278,9 @@ def _check(designs: Tensor, returns: Tensor, low: Tensor, high: Tensor) -> None:
         )
     if not designs.isfinite().all():
         raise ValueError(f"design {int((~designs.isfinite()).any(-1).nonzero()[0])} has an entry that is not finite")
-    place = in_unit_cube(designs, *bounds_for(designs, low, high))
-    beyond = (place < -ROUNDING) | (place > 1 + ROUNDING)
+    lowest, highest = bounds_for(designs, low, high)
+    width = ROUNDING * (highest - lowest).where(highest > lowest, 1)
+    beyond = (designs < lowest - width) | (designs > highest + width)
     if beyond.any():
         body, entry = beyond.nonzero()[0].tolist()
         raise ValueError(

@@ -122,7 +122,9 @@ class ParticleSwarm:
         Raises:
             ValueError: if the fitness returns another shape, or a value that is not finite.
         """
-        limits = (self._low.double().cpu().numpy(), self._high.double().cpu().numpy())
+        low, high = (bound.double().cpu().numpy() for bound in (self._low, self._high))
+        # A fixed entry moves freely, and candidates have it where it is: a periodic one of no length would be NaN.
+        limits = (low, np.where(high > low, high, low + 1))
         with _no_reports():
             star, edge, pace = Star(), BoundaryHandler(strategy=self.bounds), VelocityHandler(strategy="unmodified")
         with self._own_random_numbers():

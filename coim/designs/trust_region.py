@@ -52,7 +52,8 @@ class TrustRegion:
         Raises:
             ValueError: if ``centre`` is not in the design space, and what the search raises.
         """
-        low, high = bounds_for(centre, self._low, self._high)
+        bounds_for(centre, self._low, self._high)
+        centre, low, high = centre.to(self._low), self._low, self._high
         if centre.dim() != 1 or not bool(((low <= centre) & (centre <= high)).all()):
             raise ValueError(
                 f"the centre {centre.tolist()} is not a design between {low.tolist()} and {high.tolist()}; "

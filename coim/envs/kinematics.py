@@ -85,8 +85,10 @@ class Kinematics:
             design: ``[*B, D]``.
 
         Returns:
-            ``[*B, 1]``.
+            ``[*B, 1]``, in the wider dtype of the two; a design of whole numbers takes that of the positions.
         """
+        dtype = torch.promote_types(positions.dtype, design.dtype)
+        positions, design = positions.to(dtype), design.to(dtype)
         hanging = self._hanging(positions, design)
         start = self._table("start", design)
         if self._start_is_clearance:

@@ -116,8 +116,10 @@ def give_floor(spec: mujoco.MjSpec) -> None:
 
 
 def colliding(model: mujoco.MjModel) -> np.ndarray:
-    """Return the numbers of the robot's geoms that can touch something, in their order."""
+    """Return the numbers of the robot's geoms that can touch something, by their bits or in a pair with the floor."""
     collides = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
+    pairs = np.stack([model.pair_geom1, model.pair_geom2], 1)
+    collides[pairs[np.isin(pairs, _floors(model)).any(1)]] = True
     return np.flatnonzero((model.geom_bodyid > 0) & collides)
 
 

@@ -126,7 +126,10 @@ class DesignValue(LossModule):
         check_num_runs(None, policy, qvalue)
         self.convert_to_functional(policy, "policy")
         self.convert_to_functional(qvalue, "qvalue")
-        self.start_states = start_states.select(*policy.in_keys, *qvalue.in_keys, strict=False).detach().clone()
+        read = {*policy.in_keys, *qvalue.in_keys}
+        if self._transfer is not None:  # reads them whatever the networks do
+            read |= {self.tensor_keys.observation, self.tensor_keys.design}
+        self.start_states = start_states.select(*read, strict=False).detach().clone()
         self.chunk_size, self.precision = chunk_size, precision
         broken = [key for key, value in self.start_states.items(True, True) if not value.isfinite().all()]
         if broken:
@@ -193,12 +196,12 @@ class DesignValue(LossModule):
         rows = states.expand(len(designs), len(states))
         if self._transfer is not None:
             rows.set(self.tensor_keys.observation, self._observed(states, designs))
-        rows.set(self.tensor_keys.design, self._query(designs))
+        rows.set(self.tensor_keys.design, self._query(states, designs))
         return self.qvalue(self.policy(rows))[self.tensor_keys.state_action_value]
 
     def _bare_chunk(self, states: TensorDictBase, designs: Tensor) -> Tensor:
         """Values ``[P, n, N]`` by networks that take bare tensors."""
-        observation, design = self._observed(states, designs), self._query(designs)
+        observation, design = self._observed(states, designs), self._query(states, designs)
         return self.qvalue.values(observation, self.policy.deterministic_action(observation, design), design)
 
     def _observed(self, states: TensorDictBase, designs: Tensor) -> Tensor:
@@ -210,10 +213,10 @@ class DesignValue(LossModule):
         stored, own = self.start_states[self.tensor_keys.observation], self.start_states[self.tensor_keys.design]
         return self._transfer(stored, own, designs.unsqueeze(1)).to(seen.dtype)
 
-    def _query(self, designs: Tensor) -> Tensor:
-        """The designs for all start states, ``[P, n, D]``, in the precision of the networks."""
-        design = designs.bfloat16() if self.precision == "bfloat16" else designs
-        return design.unsqueeze(1).expand(-1, len(self.start_states), -1)
+    def _query(self, states: TensorDictBase, designs: Tensor) -> Tensor:
+        """The designs for all start states, ``[P, n, D]``, in the precision of these, which is that of the networks."""
+        seen = states.get(self.tensor_keys.observation, designs)
+        return designs.to(seen.dtype).unsqueeze(1).expand(-1, len(self.start_states), -1)
 
     def _check(self, designs: Tensor) -> None:
         size = self.start_states.get(self.tensor_keys.design, designs).shape[-1]

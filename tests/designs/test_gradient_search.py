@@ -154,3 +154,9 @@ def test_bad_options_are_refused(option: str, complaint: str) -> None:
 def test_bounds_of_something_else_are_refused() -> None:
     with pytest.raises(ValueError, match=r"pass env\.design_spec"):
         GradientSearch(SPEC.expand(3, 6))
+
+
+def test_inference_mode_is_named_and_not_the_fitness() -> None:
+    search = GradientSearch(Bounded(low=0.0, high=1.0, shape=(2,)), seed=0)
+    with torch.inference_mode(), pytest.raises(RuntimeError, match=r"which torch.inference_mode\(\) forbids"):
+        search.maximise(lambda designs: designs.sum(-1))

@@ -9,9 +9,9 @@ import sys
 import pytest
 import torch
 from torch import Tensor
-from torchrl.data import Bounded
+from torchrl.data import Bounded, Composite
 
-from coim.designs import DesignPosterior, GradientSearch, ParticleSwarm, TrustRegion
+from coim.designs import DesignPosterior, GradientSearch, NoisyDesigns, ParticleSwarm, RandomDesigns, TrustRegion
 from coim.designs.posterior import _fitted
 
 LOW, HIGH = 0.5, 2.0
@@ -287,3 +287,50 @@ def test_it_is_fitted_where_the_caller_wants_no_gradients(context: type) -> None
         inside = DesignPosterior(SPEC, built(12), returns_of(built(12))).predict(built(3, seed=9))
     for found, expected in zip(inside, outside):
         torch.testing.assert_close(found, expected)
+
+
+def test_a_prior_that_varies_by_rounding_alone_has_no_slope() -> None:
+    designs = built(12)
+    rounded = torch.tensor([1000.0, 1000.0001] * 6)
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=lambda asked: rounded[: len(asked)])
+    assert posterior.slope == 0.0
+    plain = DesignPosterior(SPEC, designs, returns_of(designs))
+    assert torch.equal(posterior(designs), plain(designs))
+
+
+def test_a_search_by_gradients_does_not_climb_past_a_prior_that_has_none() -> None:
+    designs = built(12)
+
+    def without_gradient(asked: Tensor) -> Tensor:
+        return bowl(asked.detach())
+
+    posterior = DesignPosterior(SPEC, designs, returns_of(designs), prior=without_gradient)
+    with pytest.raises(ValueError, match=r"the prior is not differentiable in the designs .*such as ParticleSwarm"):
+        GradientSearch(SPEC, seed=0).maximise(posterior)
+    assert ParticleSwarm(SPEC, num_particles=9, num_iterations=3, seed=0).maximise(posterior)[1] > 0
+
+
+def test_designs_of_whole_numbers_are_refused() -> None:
+    whole = torch.tensor([[1, 1], [2, 1], [1, 2], [2, 2]])
+    with pytest.raises(ValueError, match=r"a design is torch\.int64, .*pass design.float\(\)"):
+        DesignPosterior(SPEC, whole, torch.arange(4.0))
+    for asked in (RandomDesigns(SPEC), NoisyDesigns(SPEC)):
+        with pytest.raises(ValueError, match=r"a design is torch\.int64"):
+            asked(whole)
+    region = TrustRegion(SPEC, GradientSearch(SPEC, seed=0))
+    with pytest.raises(ValueError, match=r"a design is torch\.int64"):
+        region.maximise(bowl, centre=whole[0])
+
+
+def test_a_trust_region_takes_the_corner_of_its_spec_in_any_precision() -> None:
+    region = TrustRegion(SPEC, GradientSearch(SPEC, seed=0), reach=0.5)
+    corner = torch.tensor([LOW, LOW], dtype=torch.float64)
+    assert region.maximise(bowl, centre=corner)[0].dtype == torch.float32
+
+
+def test_bounds_that_bound_nothing_are_refused() -> None:
+    for low, high in ((2.0, 1.0), (0.0, math.inf), (math.nan, 1.0)):
+        with pytest.raises(ValueError, match="are no bounds of a design"):
+            GradientSearch(Bounded(low=torch.tensor([low, 0.0]), high=torch.tensor([high, 1.0]), shape=(2,)))
+    with pytest.raises(ValueError, match="is not the bounds of one design"):
+        GradientSearch(Composite(design=SPEC))

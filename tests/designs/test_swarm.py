@@ -177,3 +177,11 @@ def test_an_unknown_option_is_refused() -> None:
 def test_a_swarm_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         ParticleSwarm(SPEC, num_particles=0)
+
+
+@pytest.mark.parametrize("bounds", ["nearest", "periodic"])
+def test_an_entry_may_be_held_fixed(bounds: str) -> None:
+    spec = Bounded(low=torch.tensor([0.8, 1.2]), high=torch.tensor([2.0, 1.2]), shape=(2,), dtype=torch.float32)
+    search = ParticleSwarm(spec, num_particles=20, num_iterations=40, bounds=bounds, seed=0)
+    found, _ = search.maximise(lambda designs: -(designs - 1.5).square().sum(-1))
+    assert found.tolist() == pytest.approx([1.5, 1.2], abs=0.02)

@@ -191,3 +191,10 @@ def test_a_slide_that_is_not_vertical_in_the_world_is_no_height(turned: str) -> 
 def test_a_slide_behind_a_hinge_is_no_height() -> None:
     with pytest.raises(ValueError, match="a vertical slide that no hinge of the root turns"):
         on_a_root("<joint axis='0 1 0'/><joint type='slide' axis='0 0 1'/>")
+
+
+def test_designs_of_whole_numbers_are_bodies_too() -> None:
+    env = HopperMorph(seed=0)
+    state, whole = env.reset()["observation"], torch.ones(1, 4, dtype=torch.int64)
+    assert torch.equal(env.clearance(state, whole), env.clearance(state, whole.float()))
+    assert torch.equal(env.transfer(state, whole, 2 * whole), env.transfer(state, whole.float(), 2.0 * whole))

@@ -9,6 +9,7 @@ import gymnasium
 import mujoco
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from coim.envs import HopperMorph, MorphEnv
@@ -99,6 +100,22 @@ def test_a_floor_that_the_robot_would_fall_through_is_refused(drawn: str, change
 def test_a_floor_may_lie_under_one_to_look_at_and_touch_by_one_bit_or_by_a_pair(changed: str) -> None:
     text = HOPPER.read_text().replace(FLOOR, changed, 1)
     assert read_root(mujoco.MjModel.from_xml_string(text), "Hopper").kind == "planar"
+
+
+def test_what_touches_the_floor_only_in_a_pair_is_a_part_of_the_robot_too(tmp_path: Path) -> None:
+    text = HOPPER.read_text()
+    (foot,) = re.findall(r'<geom name="foot"[^>]*>', text)
+    no_bits = re.sub(r' (contype|conaffinity)="\d"', "", foot).replace(" ", ' contype="0" conaffinity="0" ', 1)
+    (tmp_path / "hopper.xml").write_text(text.replace(foot, no_bits).replace("</worldbody>", f"</worldbody>{PAIR}"))
+    own_class = type("Own", (HopperMorph,), {"ASSET": str(tmp_path / "hopper.xml")})
+    own, bits = own_class(reset_noise=0.0), HopperMorph(reset_noise=0.0)
+    taller = TensorDict({"design": torch.tensor([[1.0, 1.4, 1.2, 2.0]])}, [1])
+    for env in (own, bits):
+        env.reset(taller.clone())
+    assert own.simulations.lowest_point(0) == pytest.approx(bits.simulations.lowest_point(0), abs=1e-9)
+    state = bits.reset()["observation"]
+    expected = bits.clearance(state, taller["design"])
+    torch.testing.assert_close(own.clearance(state, taller["design"]), expected, rtol=0, atol=1e-6)
 
 
 def test_a_floor_that_is_given_carries_a_robot_of_any_bits(tmp_path: Path) -> None:

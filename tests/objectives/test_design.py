@@ -114,8 +114,10 @@ def test_it_follows_the_networks_as_they_train(parts):
     torch.testing.assert_close(fitness(designs(5)), before + 1.0)
 
 
-def test_the_action_is_deterministic_whatever_the_caller_explores(parts):
-    fitness = DesignValue(*parts)
+@pytest.mark.parametrize("wrapped", [False, True])  # asked on bare tensors, and as a TensorDict module
+def test_the_action_is_deterministic_whatever_the_caller_explores(parts, wrapped):
+    policy, qvalue, starts = parts
+    fitness = DesignValue(TensorDictSequential(policy) if wrapped else policy, qvalue, starts)
     with set_exploration_type(ExplorationType.RANDOM):
         assert torch.equal(fitness(designs(5)), fitness(designs(5)))
 
@@ -262,3 +264,23 @@ def test_states_that_cannot_be_matched_are_named(hopper_parts):
     bare = DesignValue(policy, qvalue, starts.select("observation"), start_states_are="matched", env=env)
     with pytest.raises(ValueError, match="start states to be matched lack 'design'"):
         bare(hoppers(2))
+
+
+def test_designs_of_any_precision_are_asked_in_that_of_the_networks(hopper_parts):
+    _, policy, qvalue, starts = hopper_parts
+    fitness, queries = DesignValue(policy.float(), qvalue.float(), starts.float()), hoppers(3, seed=1)
+    value = fitness(queries)
+    assert value.dtype == torch.float64
+    torch.testing.assert_close(value.float(), fitness(queries.float()), rtol=0, atol=1e-6)
+
+
+def test_bodies_are_told_apart_by_states_alone_where_the_networks_do_not_read_the_design(hopper_parts):
+    env, _, _, starts = hopper_parts
+    policy = TensorDictModule(lambda seen: seen[..., :3], in_keys=["observation"], out_keys=["action"])
+    qvalue = TensorDictModule(
+        lambda seen, a: seen[..., :1], in_keys=["observation", "action"], out_keys=["state_action_value"]
+    )
+    matched = DesignValue(policy, qvalue, starts, start_states_are="matched", env=env)
+    queries = hoppers(3, seed=1)
+    heights = torch.stack([env.transfer(starts["observation"], starts["design"], xi)[:, 0].mean() for xi in queries])
+    torch.testing.assert_close(matched(queries), heights)
