@@ -19,6 +19,7 @@ from unittest import mock
 
 import torch
 import tyro
+from scipy import stats
 from torch import Tensor
 
 from benchmarks.choosing_arms import ARMS, Arm
@@ -204,7 +205,7 @@ def summary(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 def _interval(name: str, values: list[float]) -> dict[str, str]:
     if len(values) < 2:
         return {name: "", f"{name}_low": "", f"{name}_high": ""}
-    half = 1.96 * stdev(values) / len(values) ** 0.5
+    half = stats.t.ppf(0.975, len(values) - 1) * stdev(values) / len(values) ** 0.5
     numbers = (_mean(values), _mean(values) - half, _mean(values) + half)
     return dict(zip((name, f"{name}_low", f"{name}_high"), (f"{number:.0f}" for number in numbers)))
 

@@ -5,6 +5,7 @@ Shapes: N rows, D design, R runs, X points of a curve.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,3 +142,13 @@ def spearman(x: ArrayLike, y: ArrayLike) -> float:
     if min(one.nunique(), other.nunique()) < 2:
         return float("nan")
     return float(one.corr(other, method="spearman", min_periods=3))
+
+
+def spearman_given(x: ArrayLike, y: ArrayLike, *, given: ArrayLike) -> float:
+    """Partial rank correlation with a third variable held fixed.
+
+    NaN for less than four values, or where the third variable determines one of the others.
+    """
+    x_y, x_z, y_z = spearman(x, y), spearman(x, given), spearman(y, given)
+    rest = (1 - x_z**2) * (1 - y_z**2)
+    return (x_y - x_z * y_z) / math.sqrt(rest) if len(np.asarray(x)) > 3 and rest > 1e-12 else math.nan

@@ -70,15 +70,15 @@ def test_the_summary_has_means_intervals_and_what_is_gained_more_seed_by_seed() 
     gains = {"posterior": ("100", "300"), "optimism 2": ("160", "380")}
     rows = [shared | {"arm": arm, "seed": str(n), "gain": gain} for arm in gains for n, gain in enumerate(gains[arm])]
     plain, other = summary(rows)
-    # The deviation of 100 and 300 is 141.4: 1.96 x 141.4 / sqrt(2) = 196. That of 60 and 80 is 14.14.
+    # The deviation of 100 and 300 is 141.4: 12.706 x 141.4 / sqrt(2) = 1271. That of 60 and 80 is 14.14.
     assert [plain[name] for name in ("gain", "gain_low", "gain_high", "more", "studies")] == [
         "200",
-        "4",
-        "396",
+        "-1071",
+        "1471",
         "0",
         "2",
     ]
-    assert [other[name] for name in ("more", "more_low", "more_high")] == ["70", "50", "90"]
+    assert [other[name] for name in ("more", "more_low", "more_high")] == ["70", "-57", "197"]
     assert (other["last"], other["covered_chosen"]) == ("5", "0.80")
 
 

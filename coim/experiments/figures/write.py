@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from coim.experiments.figures import (
     from_scratch,
     summary,
 )
+from coim.experiments.figures.made import made_by, made_otherwise
 from coim.experiments.figures.plot import Plot
 from coim.experiments.model_error.tables import FOLDER
 from coim.experiments.run.atomic_write import as_csv, naming_out, write_whole, written_aside
@@ -28,7 +28,6 @@ from coim.experiments.run.records import number
 from coim.experiments.statistics.intervals import FEW
 from coim.experiments.study.arms import arm_named
 from coim.experiments.study.runs import read_runs
-from coim.run_folder import read_config
 
 MODULES = (summary, best_returns, from_scratch, error_curves, design_plane, cartpole, comparisons)
 OF_MODELS = (error_curves, design_plane, cartpole)  # what a folder without cells has, Fig. 4
@@ -115,7 +114,7 @@ def page(study: Path, plots: Sequence[Plot]) -> str:
         "",
     ]
     if (study / "cells").is_dir():
-        lines += [made_by(study), "", *arms_in_words(read_runs(study).arms)]
+        lines += [made_by(study), "", *made_otherwise(study), *arms_in_words(read_runs(study).arms)]
     for plot in plots:
         lines += [f"## {plot.name}", ""]
         if plot.figure is not None:
@@ -141,39 +140,6 @@ def arms_in_words(names: Sequence[str]) -> list[str]:
     rows = [{"arm": name, "what it does": (arm := arm_named(name)).words, "compared with": ", ".join(arm.baselines)}
             for name in names]  # fmt: skip
     return [table(rows)] if rows else []
-
-
-def made_by(study: Path) -> str:
-    """A sentence on the revision of the code that made the runs, or on all of them if there are several.
-
-    Example:
-        >>> made_by(Path("docs/results/preview"))  # doctest: +SKIP
-        'All runs were made at revision 9d69483.'
-    """
-    revisions = Counter(" and ".join(sorted(revisions_of(path.parent))) for path in study.glob("cells/*/config.json"))
-    if len(revisions) < 2:
-        return f"All runs were made at revision {next(iter(revisions), 'unknown')}."
-    told = ", ".join(f"{count} at {revision}" for revision, count in sorted(revisions.items()))
-    return f"**Runs of different revisions are compared: {told}.** `CHANGELOG.md` says what moved results between them."
-
-
-def revisions_of(folder: Path) -> set[str]:
-    """Revisions of the code that began a run and of those that went on with it, where they are noted."""
-    config = read_config(folder)
-    noted = [config.get("revision"), *(entry.get("revision", "") for entry in config.get("resumed", []))]
-    return {_shortened(revision) for revision in noted if revision != ""}
-
-
-def _shortened(revision: str | None) -> str:
-    """Twelve digits of a revision, and whether its files had been changed.
-
-    Example:
-        >>> _shortened("9d69483f0c1a22b0-dirty"), _shortened(None)
-        ('9d69483f0c1a-dirty', 'unknown')
-    """
-    if revision is None:
-        return "unknown"
-    return revision[:12] + "-dirty" * revision.endswith("-dirty")
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> str:

@@ -19,7 +19,7 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000  # as rliable
 FEW = (  # measured by the tests of this module
     "A percentile bootstrap of few runs is too narrow: of normally distributed returns, its 95 % interval of the mean "
-    "(of the IQM) holds the truth in 76% (76%) of studies with 3 runs, 84% (92%) with 5 and 90% (94%) with 10."
+    "(of the IQM) holds the truth in 76% (76%) of studies with 3 runs, 84% (91%) with 5 and 90% (94%) with 10."
 )
 SEED = 0  # of the resampling: a figure that is drawn again is the same figure
 

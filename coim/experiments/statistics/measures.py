@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ import pandas as pd
 from scipy import stats
 from scipy.optimize import brentq
 
-from coim.experiments.frames import at, spearman
+from coim.experiments.frames import at, spearman, spearman_given
 from coim.experiments.predictions import coverage, worth_of_search
 from coim.experiments.statistics.intervals import Statistic, holm, improvement, interval, mean
-from coim.experiments.statistics.predicted import bias, later_predictions, spearman_given
+from coim.experiments.statistics.predicted import bias, later_predictions
 from coim.experiments.study.arms import pairs_of_arms
 from coim.experiments.study.runs import Place, Run, Runs
 
@@ -37,7 +37,10 @@ def measures(runs: Runs) -> pd.DataFrame:
         A row for each run, with what `measure` gives, in the order of the ledger.
     """
     columns = ["environment", "task", "arm", "seed", "run", "state", "over", "diverged", "designs", "planned", *NUMBERS]
-    rows = [measure(run, runs.failure((run.environment, run.task))) for run in runs.found]
+    rows = []
+    for run in runs.found:
+        place = run.environment, run.task
+        rows.append(measure(run, runs.failure(place), runs.kinds(place, run.arm)))
     found = pd.DataFrame(rows, columns=columns)
     return found.astype({"over": bool} | dict.fromkeys(MEASURES, float))  # also where there are no runs
 
@@ -57,12 +60,13 @@ NUMBERS = (
 )
 
 
-def measure(run: Run, failure: float) -> dict[str, Any]:
+def measure(run: Run, failure: float, kinds: Mapping[int, str]) -> dict[str, Any]:
     """Measure one run.
 
     Args:
         run: of a study.
         failure: counts as the best return of a diverged run on each design that it did not reach.
+        kinds: of the designs of its arm, by their numbers: what the designs that it did not reach would have been.
 
     Returns:
         What names the run (``environment``, ``task``, ``arm``, ``seed``, ``run``); its ``state``, whether it is
@@ -97,6 +101,7 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         All but the last three are NaN while they are not known; area, final and search_gain while the run is under way.
     """
     values = run.best_returns(failure) if run.over else np.array([math.nan])
+    by_kind = pd.DataFrame({"kind": [kinds.get(i + 1) for i in range(len(values))], "best_return": values})
     chosen = later_predictions(run)
     settings, rows = run.record.settings, run.record.episodes
     own = rows[rows["run"] == run.number]
@@ -116,7 +121,7 @@ def measure(run: Run, failure: float) -> dict[str, Any]:
         "planned": run.num_designs,
         "area": float(values.mean()),
         "final": float(values.max()),
-        "search_gain": worth_of_search(run.designs).value if run.over else math.nan,
+        "search_gain": worth_of_search(by_kind).value,
         "rank_correlation": spearman_given(chosen["predicted"], chosen["best_return"], given=chosen["design"]),
         "rank_correlation_raw": spearman(chosen["predicted"], chosen["best_return"]),
         "coverage": coverage(chosen).share,

@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
-from coim.experiments.frames import design_columns_of, spearman
+from coim.experiments.frames import design_columns_of
 from coim.experiments.study.runs import Run
 
 
@@ -41,16 +40,6 @@ def later_predictions(run: Run) -> pd.DataFrame:
     rows = predictions(run)
     rows = rows[rows["kind"] != "first"]
     return rows if len(rows[design_columns_of(rows)].drop_duplicates()) > 1 else rows[:0]
-
-
-def spearman_given(x: ArrayLike, y: ArrayLike, *, given: ArrayLike) -> float:
-    """Partial rank correlation with a third variable held fixed.
-
-    NaN for less than four values, or where the third variable determines one of the others.
-    """
-    x_y, x_z, y_z = spearman(x, y), spearman(x, given), spearman(y, given)
-    rest = (1 - x_z**2) * (1 - y_z**2)
-    return (x_y - x_z * y_z) / math.sqrt(rest) if len(np.asarray(x)) > 3 and rest > 1e-12 else math.nan
 
 
 def bias(rows: pd.DataFrame) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from coim.run_folder import read_config
 
 OF_STUDY = ("study.json", "retrained/designs.csv")
 LEDGERS = ("ledger.csv", "retrained/ledger.csv")
+OF_ITS_USER = r"evaluation(-\d+)?\.csv"  # what `coim evaluate` left, with paths of this machine
 RUNS = ("cells", "retrained/cells", "model_error")
 
 
@@ -27,7 +29,7 @@ def archive(study: Path, target: Path) -> list[Path]:
         The run folders that were copied, relative to the study's.
 
     Raises:
-        ValueError: if the folder is no study's, or no run of it is over.
+        ValueError: if the folder is no study's, no run of it is over, or the target keeps runs that it does not have.
     """
     if not (study / "cells").is_dir():
         raise ValueError(
@@ -37,6 +39,7 @@ def archive(study: Path, target: Path) -> list[Path]:
     kept = [name for name in runs_in(study) if over(study / name)]
     if not kept:
         raise ValueError(f"no run of {study} is over yet; let the study go on")
+    refuse_loss(study, target)
     for name in set(runs_in(target)) - set(kept):  # the study was changed since, and they go on
         remove_run(target / name)
     for name in kept:
@@ -67,6 +70,19 @@ def refuse_target(study: Path, target: Path) -> None:
         raise ValueError(f"{target} keeps another study, {kept!r}, and this one is {own!r}; name another folder")
 
 
+def refuse_loss(study: Path, target: Path) -> None:
+    """Refuse to delete runs of an archive that came from elsewhere, as of a study that two machines computed.
+
+    Raises:
+        ValueError: that names one of them.
+    """
+    if elsewhere := sorted(set(runs_in(target)) - set(runs_in(study))):
+        raise ValueError(
+            f"{target} keeps {len(elsewhere)} run(s) that {study} does not have, such as {elsewhere[0]}; they would be "
+            "lost: archive into a new folder and put the two together, or delete them yourself"
+        )
+
+
 def name_of(study: Path) -> str | None:
     """What a study is called in its ``study.json``, if it has one."""
     path = study / "study.json"
@@ -94,6 +110,8 @@ def copy_run(folder: Path, target: Path, name: Path) -> None:
         resumption["changed"].pop("out", None)
     write_whole(target / "config.json", json.dumps(config, indent=2) + "\n")
     for table in folder.glob("*.csv"):
+        if re.fullmatch(OF_ITS_USER, table.name):
+            continue
         write_whole(target / table.name, table.read_bytes())
 
 

@@ -151,6 +151,11 @@ class Runs:
         runs = [run for run in self.found if (run.environment, run.task, run.arm) == (*place, arm)]
         return sorted(runs, key=lambda run: (run.seed, run.number))
 
+    def kinds(self, place: Place, arm: str) -> dict[int, str]:
+        """Kind of each design of an arm, by its number, as far as any of its runs has come: they take turns alike."""
+        tables = [run.designs for run in self.of(place, arm)]
+        return {design: kind for table in tables for design, kind in zip(table["design"], table["kind"])}
+
     def failure(self, place: Place) -> float:
         """What a design that a diverged run did not reach counts: the lowest best return of any design there.
 

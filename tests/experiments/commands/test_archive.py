@@ -10,6 +10,7 @@ import pytest
 from coim.experiments.commands.archive import main
 from coim.experiments.figures.write import write_figures
 from coim.experiments.run.settings import plain
+from coim.experiments.study.archive import archive
 from coim.experiments.study.definition import Study, to_json
 from coim.experiments.study.ledger import Ledger
 from coim.experiments.study.ray_scheduler import Resources, take_up
@@ -155,3 +156,27 @@ def test_what_cannot_be_kept_is_told(study: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=r"no run of .*young is over yet"):
         main([str(tmp_path / "young"), str(tmp_path / "kept")])
     assert not (tmp_path / "kept").exists()
+
+
+def test_runs_that_an_archive_has_from_elsewhere_are_not_deleted(study: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    archive(study, kept)
+    write_cell(kept, "hopper-forward-none-7", [1, 2, 3, 4])
+    before = {path: path.read_bytes() for path in kept.rglob("*.csv")}
+    with pytest.raises(
+        ValueError, match=r"keeps 1 run\(s\) that .* does not have, such as cells/hopper-forward-none-7; they"
+    ):
+        archive(study, kept)
+    assert before == {path: path.read_bytes() for path in kept.rglob("*.csv")}
+
+
+def test_what_its_user_evaluated_stays_where_it_is(study: Path, tmp_path: Path) -> None:
+    cell = Path("cells") / "hopper-forward-none-0"
+    for name in ("evaluation.csv", "evaluation-2.csv"):
+        (study / cell / name).write_text("source\n/home/somebody/run\n")
+    archive(study, tmp_path / "kept")
+    assert {path.name for path in (tmp_path / "kept" / cell).iterdir()} == {
+        "config.json",
+        "designs.csv",
+        "evaluations.csv",
+    }

@@ -16,7 +16,7 @@ from tiny_runs import run_by_options
 
 from coim import HopperMorph, run_episode
 from coim.experiments.commands.report import main
-from coim.experiments.frames import designs_of
+from coim.experiments.frames import designs_of, spearman_given
 from coim.experiments.report.designs import describe_correlation
 from coim.experiments.report.run_report import write_report
 from coim.experiments.run.records import number, read_record, read_records
@@ -42,7 +42,7 @@ def test_the_end_of_a_run_writes_a_page_with_every_picture_beside_the_old_one(re
     assert config["versions"]["torch"] in page.words
     assert config["revision"] is None or config["revision"] in page.words
     assert "all 7 designs are done" in page.words
-    assert "(n = 6 designs)" in page.words  # the first is built without a prediction
+    assert "not defined (n = 2 designs after the first ones, four are needed)" in page.words
     (curves,) = [image["alt"] for image in page.images if image["alt"].startswith("Return over training steps")]
     bodies = HopperMorph(num_runs=4, episode_steps=config["settings"]["episode_steps"], seed=0)
     design = torch.tensor(HopperMorph.FIRST_DESIGNS[0]).expand(4, -1)
@@ -110,7 +110,7 @@ def test_a_fleet_shows_the_mean_and_each_run(reported: Path) -> None:
     page = check(reported / "fleet" / "report.html")
     assert all(f"run {run}" in page.words for run in range(3))
     assert "mean of 3 runs" in page.words
-    assert "(n = 6 each)" in page.words
+    assert "not defined (n = 6 designs after the first ones, four are needed)" in page.words
 
 
 def test_a_run_without_imagination_says_so_where_the_model_error_would_be(reported: Path) -> None:
@@ -203,15 +203,23 @@ def test_names_are_words_and_neither_tags_nor_formulas(reported: Path, tmp_path:
     assert "_$x_{1$" in page.words
 
 
-def test_the_rank_correlation_is_told_of_each_run() -> None:
-    def rows(*pairs: tuple[float, float], run: int = 0) -> pd.DataFrame:
-        return pd.DataFrame(pairs, columns=["predicted", "best_return"]).assign(run=run)
+def test_the_rank_correlation_is_told_of_each_run_after_the_first_bodies_and_with_the_order_held_fixed() -> None:
+    def rows(*best: float, run: int = 0) -> pd.DataFrame:
+        columns = {"design": range(1, 7), "kind": ["first"] * 2 + ["optimised", "random"] * 2, "run": run}
+        return pd.DataFrame(columns | {"predicted": [90, 80, 2, 1, 4, 3], "best_return": best})
 
-    rising, falling = rows((1, 1), (2, 10), (3, 11)), rows((1, 9), (2, 3), (3, 2), run=1)
-    assert describe_correlation(rising) == "Spearman's rank correlation 1.00 (n = 3 designs)"
-    both = pd.concat([rising, falling])
-    assert "0.00, mean of 2 runs, from -1.00 to 1.00 (n = 3 each)" in describe_correlation(both)
-    assert describe_correlation(rising[:0]) == "rank correlation not defined (n = 0 designs)"
+    # The order explains the rise of both; what it leaves agrees in one run and disagrees in the other.
+    agreeing, other = rows(0, 9, 2, 1, 4, 3), rows(9, 0, 1, 2, 3, 4, run=1)
+    assert describe_correlation(agreeing) == (
+        "Spearman's rank correlation with the order of building held fixed 1.00 (n = 4 designs)"
+    )
+    by_hand = spearman_given([2, 1, 4, 3], [1, 3, 2, 4], given=[3, 4, 5, 6])
+    mixed = pd.concat([agreeing, other.assign(best_return=[9, 0, 1, 3, 2, 4])])
+    words = f"{(1 + by_hand) / 2:.2f}, mean of 2 runs, from {by_hand:.2f} to 1.00 (n = 4 each)"
+    assert words in describe_correlation(mixed)
+    assert describe_correlation(agreeing[:5]) == (
+        "rank correlation not defined (n = 3 designs after the first ones, four are needed)"
+    )
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -58,7 +58,7 @@ def test_improvement_is_mann_whitneys_u_over_the_pairs() -> None:
     assert improvement(x, x) == 0.5
 
 
-@pytest.mark.parametrize(("runs", "of_the_mean", "of_the_iqm"), [(3, 0.76, 0.76), (5, 0.84, 0.92), (10, 0.90, 0.94)])
+@pytest.mark.parametrize(("runs", "of_the_mean", "of_the_iqm"), [(3, 0.76, 0.76), (5, 0.84, 0.91), (10, 0.90, 0.94)])
 def test_intervals_of_few_runs_hold_the_truth_as_often_as_is_said(
     runs: int, of_the_mean: float, of_the_iqm: float
 ) -> None:

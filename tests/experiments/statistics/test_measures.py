@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from coim.experiments.frames import spearman
+from coim.experiments.frames import spearman, spearman_given
+from coim.experiments.statistics.intervals import improvement, interval
 from coim.experiments.statistics.measures import (
     comparisons,
     detectable,
@@ -18,18 +19,19 @@ from coim.experiments.statistics.measures import (
     paired,
     welch,
 )
-from coim.experiments.statistics.predicted import spearman_given
 from coim.experiments.statistics.retrained import with_retrained
 from coim.experiments.study.arms import pairs_of_arms
 from coim.experiments.study.definition import Study, to_json
 from coim.experiments.study.runs import parts_of, read_runs
-from tests.experiments.made_up_study import read_table, write_cell, write_ledger, write_table
+from tests.experiments.made_up_study import KINDS, read_table, write_cell, write_ledger, write_table
+
+BY_NUMBER = dict(enumerate(KINDS, 1))
 
 
 def test_area_is_the_mean_over_designs_and_final_the_highest(tmp_path: Path) -> None:
     write_cell(tmp_path, "hopper-forward-known-0", [10, 40, 20, 30])
     (run,) = read_runs(tmp_path).found
-    found = measure(run, failure=-100)
+    found = measure(run, failure=-100, kinds=BY_NUMBER)
     assert (run.state, found["area"], found["final"]) == ("finished", 25, 40)
     assert found["search_gain"] == 20 - 30  # design 3 was searched for, design 4 drawn
     # (1 - .9) Q against best return / 10 steps, of design 3, which was searched for, and 4, which was drawn
@@ -46,7 +48,7 @@ def test_the_seconds_of_an_episode_are_the_median_of_those_in_its_metrics(tmp_pa
     rows = [[*place, seconds] for place, seconds in zip(places, (90.0, 3.0, 5.0, 4.0), strict=True)]
     write_table(folder / "metrics.csv", ["run", "design", "episode", "seconds/episode"], rows)
     (run,) = read_runs(tmp_path).found
-    assert measure(run, failure=0)["episode_seconds"] == 4.5
+    assert measure(run, failure=0, kinds=BY_NUMBER)["episode_seconds"] == 4.5
 
 
 def test_what_only_rises_with_the_order_of_building_correlates_but_not_given_the_order() -> None:
@@ -66,15 +68,19 @@ def test_a_correlation_given_what_determines_it_is_none() -> None:
 def test_first_designs_and_a_body_that_never_changes_say_nothing_of_the_ranking(tmp_path: Path) -> None:
     folder = write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], predicted=(None, 90.0, 2.0, 3.0))
     (run,) = read_runs(tmp_path).found
-    assert measure(run, failure=0)["bias_random"] == pytest.approx(
+    assert measure(run, failure=0, kinds=BY_NUMBER)["bias_random"] == pytest.approx(
         0.3 - 3
     )  # and Q = 90 of a first design counts nowhere
+    alike = {"kinds": [*KINDS, *KINDS[2:]], "num_designs": 6, "predicted": (90.0, 80.0, 2.0, 1.0, 4.0, 3.0)}
+    write_cell(tmp_path / "longer", "hopper-forward-none-0", [0, 9, 20, 10, 40, 30], **alike)
+    (longer,) = read_runs(tmp_path / "longer").found
+    assert measure(longer, failure=0, kinds=BY_NUMBER)["rank_correlation"] == pytest.approx(1)
     for name in ("evaluations.csv", "designs.csv"):
         rows = read_table(folder / name)
         fixed = [row | {"kind": "fixed", "xi_1": "0.5"} for row in rows]
         write_table(folder / name, list(fixed[0]), [list(row.values()) for row in fixed])
     (run,) = read_runs(tmp_path).found
-    found = measure(run, failure=0)
+    found = measure(run, failure=0, kinds=BY_NUMBER)
     for value in (
         found["rank_correlation"],
         found["rank_correlation_raw"],
@@ -90,7 +96,7 @@ def test_what_a_posterior_expected_is_the_prediction_of_its_run_and_its_interval
     returns = [90, 50 + 16, 40 - 17, 30 + 17, 20 - 16]  # 1.645 deviations are within
     write_cell(tmp_path, "hopper-forward-grounded-0", returns, kinds=kinds, expected=expected, num_designs=5)
     write_cell(tmp_path, "hopper-forward-none-0", returns, kinds=kinds, num_designs=5)
-    runs = {run.arm: measure(run, failure=0) for run in read_runs(tmp_path).found}
+    runs = {run.arm: measure(run, failure=0, kinds=BY_NUMBER) for run in read_runs(tmp_path).found}
     assert runs["grounded"]["coverage"] == 0.5
     assert math.isnan(runs["none"]["coverage"])
     assert runs["grounded"]["rank_correlation_raw"] == pytest.approx(spearman([4, 3, 2, 1], returns[1:]))
@@ -101,7 +107,9 @@ def test_what_a_posterior_expected_is_the_prediction_of_its_run_and_its_interval
 def test_who_learns_no_model_has_no_updates_of_it(tmp_path: Path) -> None:
     write_cell(tmp_path, "hopper-forward-none-0", [10, 40, 20, 30], imagine="none")
     write_cell(tmp_path, "hopper-forward-oracle-0", [10, 40, 20, 30], dream="simulator")
-    assert [measure(run, failure=0)["updates"] for run in read_runs(tmp_path).found] == [8 * (5 + 3)] * 2
+    assert [measure(run, failure=0, kinds=BY_NUMBER)["updates"] for run in read_runs(tmp_path).found] == [
+        8 * (5 + 3)
+    ] * 2
 
 
 def test_a_diverged_run_counts_with_the_lowest_return_of_its_place_on_what_it_did_not_reach(tmp_path: Path) -> None:
@@ -114,21 +122,27 @@ def test_a_diverged_run_counts_with_the_lowest_return_of_its_place_on_what_it_di
     assert failure == -6
     assert broken.state == "diverged"
     assert broken.best_returns(failure).tolist() == [10, 40, -6, -6]
-    found = measure(broken, failure)
+    found = measure(broken, failure, runs.kinds(("hopper", "forward"), "known"))
     assert (found["area"], found["final"]) == (9.5, 40)  # the body that it had found before is still there
+    assert math.isnan(found["search_gain"])  # no run of its arm came to a body that was searched for
+    write_cell(tmp_path, "hopper-forward-known-1", [10, 40, 20, 5])
+    write_cell(tmp_path, "hopper-forward-known-2", [10, 40, 20], diverged=[0])
+    gains = measures(read_runs(tmp_path)).set_index(["task", "arm", "seed"])["search_gain"]
+    assert gains["forward", "known"].to_dict() == {0: 0, 1: 15, 2: 20 + 6}
     assert "1 of them diverged" in runs.in_words(["known", "none"])
 
 
 def test_a_run_under_way_has_no_area_yet_and_its_last_design_no_best_return(tmp_path: Path) -> None:
-    folder = write_cell(tmp_path, "hopper-forward-known-0", [10, 40, 20])
+    kinds = {number + 2 * later: kind for later in (0, 1) for number, kind in BY_NUMBER.items()}
+    folder = write_cell(tmp_path, "hopper-forward-known-0", [10, 40, 20, 5, 7], kinds=[*kinds.values()], num_designs=6)
     lines = (folder / "designs.csv").read_text().splitlines()
-    (folder / "designs.csv").write_text("\n".join(lines[:-1]) + "\n")  # design 3 still has episodes to come
+    (folder / "designs.csv").write_text("\n".join(lines[:-1]) + "\n")  # design 5 still has episodes to come
     (run,) = read_runs(tmp_path).found
-    assert run.designs["design"].tolist() == [1, 2]
+    assert run.designs["design"].tolist() == [1, 2, 3, 4]
     assert run.state == "under way"
-    assert math.isnan(measure(run, failure=0)["area"])
-    assert math.isnan(measure(run, failure=0)["search_gain"])
-    assert np.isnan(run.best_returns(0)).tolist() == [False, False, True, True]
+    assert math.isnan(measure(run, failure=0, kinds=BY_NUMBER)["area"])
+    assert math.isnan(measure(run, failure=0, kinds=kinds)["search_gain"])
+    assert np.isnan(run.best_returns(0)).tolist() == [False] * 4 + [True] * 2
 
 
 def test_each_run_of_a_fleet_counts_and_the_ledger_says_what_is_to_come(tmp_path: Path) -> None:
@@ -239,9 +253,9 @@ def test_comparisons_pair_by_seed_correct_each_measure_by_itself_and_join_the_pl
     mine, theirs = [30.0, 10.0, 50.0], [11.0, 5.0, 28.0]
     for task in ("forward", "backward"):
         for seed in range(3):
-            write_cell(tmp_path, f"hopper-{task}-known-{seed}", [mine[seed]] * 4)
-            write_cell(tmp_path, f"hopper-{task}-none-{seed}", [theirs[seed]] * 4)
-    write_cell(tmp_path, "hopper-forward-none-7", [20.0] * 4)  # has no partner
+            write_cell(tmp_path, f"hopper-{task}-known-{seed + 1}", [mine[seed]] * 4)
+            write_cell(tmp_path, f"hopper-{task}-none-{seed + 1}", [theirs[seed]] * 4)
+    write_cell(tmp_path, "hopper-forward-none-0", [20.0] * 4)  # has no partner, and comes before those that have one
     runs = read_runs(tmp_path)
     rows = comparisons(runs, with_retrained(measures(runs), tmp_path)).to_dict("records")
     assert [(row["measure"], row["task"]) for row in rows] == [
@@ -254,6 +268,9 @@ def test_comparisons_pair_by_seed_correct_each_measure_by_itself_and_join_the_pl
     assert (forward["paired_difference_low"], forward["paired_difference_high"]) == (5, 22)  # of three, the ends
     assert -11 < forward["difference_low"] < 14 < forward["difference_high"] < 45
     assert forward["improvement"] == pytest.approx((4 + 1 + 4) / 12)
+    low, high = interval(improvement, np.array(mine), np.array([20.0, *theirs]))
+    assert (forward["improvement_low"], forward["improvement_high"]) == (low, high)
+    assert 1 - high < low < high
     assert forward["welch_p"] == pytest.approx(stats.ttest_ind(mine, [*theirs, 20.0], equal_var=False).pvalue)
     assert forward["paired_p"] == pytest.approx(stats.ttest_rel(mine, theirs).pvalue)
     assert forward["paired_p_holm"] == pytest.approx(2 * stats.ttest_rel(mine, theirs).pvalue)  # two places

@@ -28,7 +28,8 @@ def study(tmp_path: Path) -> Path:
         write_cell(*cell, kinds=KINDS, num_designs=6, expected=expected)
         cell = tmp_path, f"hopper-forward-random-bodies-{seed}", [1, 2, 3, 4 + seed, 6, 5]
         write_cell(*cell, kinds=["first"] * 2 + ["random"] * 4, num_designs=6, predicted=(None, 1, 4, 2, 5, 3))
-    write_cell(tmp_path, "hopper-forward-grounded-2", [1, 2, 3], kinds=KINDS, num_designs=6)
+    cell = tmp_path, "hopper-forward-grounded-2", [1, 2, 90, 70, 80]
+    write_cell(*cell, kinds=KINDS, num_designs=6, expected=expected)
     write_cell(tmp_path, "walker-backward-none-0", [1, 2, 3, 4, 5, 6], kinds=KINDS, num_designs=6)
     return tmp_path
 
