@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -136,6 +136,19 @@ class DesignPosterior:
         self.model = _fitted(inputs, (targets - self._mean) / self._scale)
         self._prior_mean: _PriorMean = self.model.mean_module
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for pickle and deepcopy: gpytorch's priors cannot be pickled, a copy makes the process anew."""
+        state = {key: value for key, value in vars(self).items() if key not in ("model", "_prior_mean")}
+        return state | {"process": (self.model.train_inputs[0], self.model.train_targets, self.model.state_dict())}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        inputs, targets, weights = state.pop("process")
+        vars(self).update(state)
+        self.model = _process(inputs, targets)
+        self.model.load_state_dict(weights)
+        self.model.requires_grad_(False).eval()
+        self._prior_mean = self.model.mean_module
+
     def __call__(self, designs: Tensor) -> Tensor:
         """Upper confidence bound of the return of candidates ``[P, D]``, if built next: ``[P]``."""
         mean, variance = self._posterior(designs)
@@ -240,6 +253,16 @@ class _PriorMean(Mean):
 @torch.enable_grad()  # the caller may be under no_grad: a whole training is
 def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
     """The process of highest posterior density for inputs ``[N, D + 2]`` and standardised returns ``[N]``."""
+    inputs, targets = inputs.clone(), targets.clone()  # those of an inference mode have no gradients
+    model = _process(inputs, targets)
+    with torch.device("cpu"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", OptimizationWarning)
+        fit_gpytorch_mll_scipy(ExactMarginalLogLikelihood(model.likelihood, model))
+    return model.requires_grad_(False).eval()
+
+
+def _process(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
+    """The process before it is fitted: the medians of its priors."""
 
     def positive(median: float) -> GreaterThan:
         return GreaterThan(1e-4, transform=None, initial_value=median)
@@ -247,7 +270,6 @@ def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
     def around(median: float) -> LogNormalPrior:
         return LogNormalPrior(math.log(median), SPREAD)
 
-    inputs, targets = inputs.clone(), targets.clone()  # those of an inference mode have no gradients
     num_entries = inputs.shape[-1] - 2
     # On the CPU whatever torch's default device is; the last input may leave the unit cube.
     with torch.device("cpu"), botorch.settings.validate_input_scaling(False):
@@ -256,7 +278,7 @@ def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
             lengthscale_prior=around(LENGTH),
             lengthscale_constraint=positive(LENGTH),
         )
-        model = SingleTaskGP(
+        return SingleTaskGP(
             inputs,
             targets.unsqueeze(-1),
             likelihood=GaussianLikelihood(noise_prior=around(NOISE), noise_constraint=positive(NOISE)),
@@ -264,10 +286,6 @@ def _fitted(inputs: Tensor, targets: Tensor) -> SingleTaskGP:
             mean_module=_PriorMean(),
             outcome_transform=None,
         )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", OptimizationWarning)
-            fit_gpytorch_mll_scipy(ExactMarginalLogLikelihood(model.likelihood, model))
-    return model.requires_grad_(False).eval()
 
 
 def _check(designs: Tensor, returns: Tensor, low: Tensor, high: Tensor) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -334,3 +337,12 @@ def test_bounds_that_bound_nothing_are_refused() -> None:
             GradientSearch(Bounded(low=torch.tensor([low, 0.0]), high=torch.tensor([high, 1.0]), shape=(2,)))
     with pytest.raises(ValueError, match="is not the bounds of one design"):
         GradientSearch(Composite(design=SPEC))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda posterior: pickle.loads(pickle.dumps(posterior))])
+def test_a_copy_says_the_same_to_the_last_bit(copied: Callable[[DesignPosterior], DesignPosterior]) -> None:
+    posterior = DesignPosterior(SPEC, built(9), returns_of(built(9)), prior=bowl)
+    other, asked = copied(posterior), built(30)
+    assert torch.equal(other(asked), posterior(asked))
+    assert all(map(torch.equal, other.predict(asked), posterior.predict(asked)))
+    assert (other.slope, other.trend, other.noise) == (posterior.slope, posterior.trend, posterior.noise)
