@@ -137,7 +137,7 @@ class DesignPosterior:
         self._prior_mean: _PriorMean = self.model.mean_module
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for pickle and deepcopy: gpytorch's priors cannot be pickled, a copy makes the process anew."""
+        """Return the state for pickle and deepcopy: gpytorch's priors cannot be pickled, so a copy has its own."""
         state = {key: value for key, value in vars(self).items() if key not in ("model", "_prior_mean")}
         return state | {"process": (self.model.train_inputs[0], self.model.train_targets, self.model.state_dict())}
 
