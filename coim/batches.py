@@ -16,6 +16,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
+ROUNDING = 1e-9  # of shares that are the rest of others
+
 
 def sample_batches(
     buffer: TensorDictReplayBuffer,
@@ -131,11 +133,13 @@ def batch_parts(batch_size: int, *, imagined: float = 0.0, other: float = 0.0) -
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"the {name} share is {share}, it must lie in [0, 1]")
     rows = round(batch_size * imagined), round(batch_size * other)
+    if abs(1 - imagined - other) < ROUNDING:  # there is no third part that a rounded row could come from or go to
+        rows = rows[0], batch_size - rows[0]
     own = batch_size - sum(rows)
     if own < 0:
         raise ValueError(f"shares {imagined} and {other} of a batch of {batch_size} rows need {sum(rows)}; lower them")
     wanted = (1 - imagined - other, own), (other, rows[1]), (imagined, rows[0])
-    if any(share > 1e-9 and not count for share, count in wanted):
+    if any(share > ROUNDING and not count for share, count in wanted):
         raise ValueError(
             f"a batch of {batch_size} rows is smaller than its parts: shares {imagined} and {other} make it {own} + "
             f"{rows[1]} + {rows[0]} rows; enlarge the batch, or set a share to 0"

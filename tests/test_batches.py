@@ -107,6 +107,13 @@ def test_batch_parts_of_the_paper() -> None:
     assert batch_parts(256, other=0.1) == BatchParts(own=230, other=26, imagined=0)
 
 
+@pytest.mark.parametrize(("size", "imagined", "other"), [(5, 0.5, 0.5), (3, 0.5, 0.5), (5, 0.3, 0.7), (256, 0.1, 0.9)])
+def test_shares_that_are_the_whole_leave_no_row_to_a_third_part(size: int, imagined: float, other: float) -> None:
+    parts = batch_parts(size, imagined=imagined, other=other)
+    assert (parts.own, parts.imagined + parts.other) == (0, size)
+    assert abs(parts.imagined - size * imagined) <= 0.5
+
+
 def test_readers_with_generators_of_their_own_do_not_disturb_each_other() -> None:
     """What one reader gets does not depend on whether another one read before it."""
     buffer = filled(1000)
