@@ -26,16 +26,16 @@ Chosen = Sequence[tuple[int, str, float]]  # seed, body and best return, NaN whe
 
 
 def write_retrained(
-    study: Path, arms: Mapping[str, Chosen], environment: str = "hopper", **noted: object
+    study: Path, arms: Mapping[str, Chosen], environment: str = "hopper", task: str = "forward", **noted: object
 ) -> list[dict[str, object]]:
     """Retrained designs of one place in a study of one cell; returns what stands in designs.csv."""
     (study / "cells" / "hopper-forward-none-0").mkdir(parents=True, exist_ok=True)
     lines: list[dict[str, object]] = []
     for arm, chosen in arms.items():
         for index, (seed, xi, best) in enumerate(chosen):
-            cell = f"{environment}-forward-{arm}-{seed}"
+            cell = f"{environment}-{task}-{arm}-{seed}"
             name = f"{cell}-run0-design{index}"
-            line = {"folder": name, "cell": cell, "environment": environment, "task": "forward", "arm": arm}
+            line = {"folder": name, "cell": cell, "environment": environment, "task": task, "arm": arm}
             lines.append(line | {"seed": seed, "run": 0} | {"design": index, "xi": xi, "found_return": 30} | noted)
             diverged = [0] if math.isnan(best) else []
             write_cell(study, name, [best], part="retrained/cells", diverged=diverged, num_designs=1, first_episodes=9)
@@ -186,6 +186,15 @@ def test_a_retraining_without_a_return_counts_with_the_lowest_of_its_place_and_a
         "4 of 4 designs are retrained, 1 of them diverged; 1 without a return until then: counts with the lowest best "
         "return of its place." in designs.notes
     )
+
+
+def test_the_lowest_return_is_that_of_the_same_task(tmp_path: Path) -> None:
+    lines = write_retrained(tmp_path, {"none": of_seeds(-90), "known": of_seeds(-80)}, task="backward")
+    lines += write_retrained(tmp_path, {"none": of_seeds(4, 2), "known": of_seeds(9, math.nan)})
+    list_designs(tmp_path, lines)
+    designs, _ = drawn(tmp_path)
+    found = [(row["task"], row["best_return"]) for row in designs.rows]
+    assert sorted(found) == [("backward", -90), ("backward", -80), *(("forward", best) for best in (2, 2, 4, 9))]
 
 
 def test_a_retraining_that_diverged_later_counts_with_what_it_had(tmp_path: Path) -> None:
