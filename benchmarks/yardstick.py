@@ -29,11 +29,10 @@ from torch import Tensor
 from benchmarks.surfaces import uniform
 from coim import MorphEnv, load_run, run_episode
 from coim.envs.native_episode import can_be_native
-from coim.experiments.frames import read_frame
+from coim.experiments.frames import read_frame, spearman, spearman_given
 from coim.experiments.run.interrupt import on_command_line
 from coim.experiments.run.machine import prepare
 from coim.experiments.run.provenance import git_revision
-from coim.experiments.statistics.predicted import spearman, spearman_given
 from coim.experiments.statistics.retrained import results
 from coim.experiments.study.runs import CHOSEN
 from coim.run_folder import DESIGNS
