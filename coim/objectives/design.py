@@ -126,9 +126,9 @@ class DesignValue(LossModule):
         check_num_runs(None, policy, qvalue)
         self.convert_to_functional(policy, "policy")
         self.convert_to_functional(qvalue, "qvalue")
-        read = {*policy.in_keys, *qvalue.in_keys}
+        read = [*policy.in_keys, *qvalue.in_keys]
         if self._transfer is not None:  # reads them whatever the networks do
-            read |= {self.tensor_keys.observation, self.tensor_keys.design}
+            read += [self.tensor_keys.observation, self.tensor_keys.design]
         self.start_states = start_states.select(*read, strict=False).detach().clone()
         self.chunk_size, self.precision = chunk_size, precision
         broken = [key for key, value in self.start_states.items(True, True) if not value.isfinite().all()]
