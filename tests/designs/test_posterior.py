@@ -11,33 +11,14 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from noisy_bowl import HIGH, LOW, SPEC, TOP, bowl, built, noise, returns_of
 from torch import Tensor
-from torchrl.data import Bounded, Composite
+from torchrl.data import Bounded
 
-from coim.designs import DesignPosterior, GradientSearch, NoisyDesigns, ParticleSwarm, RandomDesigns, TrustRegion
+from coim.designs import DesignPosterior, GradientSearch, ParticleSwarm, TrustRegion
 from coim.designs.posterior import _fitted
 
-LOW, HIGH = 0.5, 2.0
-SPEC = Bounded(low=LOW, high=HIGH, shape=(2,), dtype=torch.float32)
 SPEC4 = Bounded(low=LOW, high=HIGH, shape=(4,), dtype=torch.float32)
-TOP = torch.tensor([1.0, 1.6])
-
-
-def bowl(designs: Tensor) -> Tensor:
-    """Best at TOP, where it is 0."""
-    return -(designs - TOP.to(designs)).square().sum(-1)
-
-
-def built(number: int, seed: int = 0, *, entries: int = 2) -> Tensor:
-    return LOW + (HIGH - LOW) * torch.rand(number, entries, generator=torch.Generator().manual_seed(seed))
-
-
-def noise(number: int, deviation: float, seed: int = 1) -> Tensor:
-    return deviation * torch.randn(number, generator=torch.Generator().manual_seed(seed))
-
-
-def returns_of(designs: Tensor, deviation: float = 100.0) -> Tensor:
-    return 1000 + 400 * bowl(designs) + noise(len(designs), deviation)
 
 
 @pytest.mark.parametrize("search", [GradientSearch(SPEC, seed=0), ParticleSwarm(SPEC, num_particles=50, seed=0)])
@@ -216,24 +197,6 @@ def test_without_botorch_everything_else_works_and_the_posterior_says_what_to_in
     assert "line 3" in result.stderr.splitlines()[1]
 
 
-def test_a_trust_region_holds_the_best_near_its_centre_and_ends_at_the_bounds() -> None:
-    region = TrustRegion(SPEC, GradientSearch(SPEC, seed=0), reach=0.2)
-    near, value = region.maximise(bowl, centre=torch.tensor([1.8, 1.5]))
-    assert near.tolist() == pytest.approx([1.8 - 0.2 * 1.5, 1.6], abs=0.01)
-    assert value == pytest.approx(bowl(near).item())
-    at_edge, _ = region.maximise(lambda x: -x.sum(-1), centre=torch.tensor([0.6, 2.0]))
-    assert at_edge.tolist() == pytest.approx([0.5, 1.7])
-
-
-def test_a_trust_region_stays_where_its_search_looks() -> None:
-    narrow = Bounded(low=1.0, high=1.2, shape=(2,), dtype=torch.float32)
-    region = TrustRegion(SPEC, GradientSearch(narrow, seed=0), reach=0.05)
-    for slope in (-1.0, 1.0):
-        for centre, reached in ((1.1, 1.1 + slope * 0.075), (0.6, 1.0), (1.9, 1.2)):
-            found, _ = region.maximise(lambda x, slope=slope: slope * x.sum(-1), centre=torch.full((2,), centre))
-            assert found.tolist() == pytest.approx([reached] * 2)
-
-
 def test_an_entry_may_be_held_fixed() -> None:
     spec = Bounded(low=torch.tensor([LOW, 1.2]), high=torch.tensor([HIGH, 1.2]), shape=(2,), dtype=torch.float32)
     designs = built(12)
@@ -260,14 +223,6 @@ def test_numbers_stay_on_the_cpu_under_another_default_device() -> None:
         with torch.device("meta"):
             again = DesignPosterior(SPEC, designs, returns, prior=prior)
             assert all(torch.equal(one, other) for one, other in zip(expected, again.predict(designs)))
-
-
-def test_a_trust_region_refuses_a_centre_outside_and_a_reach_of_nothing() -> None:
-    search = GradientSearch(SPEC, seed=0)
-    with pytest.raises(ValueError, match=r"the centre \[2.5, 1.0\] is not a design"):
-        TrustRegion(SPEC, search).maximise(bowl, centre=torch.tensor([2.5, 1.0]))
-    with pytest.raises(ValueError, match="reach is 0"):
-        TrustRegion(SPEC, search, reach=0)
 
 
 def test_the_difference_of_two_bodies_is_that_of_their_means_and_of_neighbours_surer_than_either() -> None:
@@ -311,32 +266,6 @@ def test_a_search_by_gradients_does_not_climb_past_a_prior_that_has_none() -> No
     with pytest.raises(ValueError, match=r"the prior is not differentiable in the designs .*such as ParticleSwarm"):
         GradientSearch(SPEC, seed=0).maximise(posterior)
     assert ParticleSwarm(SPEC, num_particles=9, num_iterations=3, seed=0).maximise(posterior)[1] > 0
-
-
-def test_designs_of_whole_numbers_are_refused() -> None:
-    whole = torch.tensor([[1, 1], [2, 1], [1, 2], [2, 2]])
-    with pytest.raises(ValueError, match=r"a design is torch\.int64, .*pass design.float\(\)"):
-        DesignPosterior(SPEC, whole, torch.arange(4.0))
-    for asked in (RandomDesigns(SPEC), NoisyDesigns(SPEC)):
-        with pytest.raises(ValueError, match=r"a design is torch\.int64"):
-            asked(whole)
-    region = TrustRegion(SPEC, GradientSearch(SPEC, seed=0))
-    with pytest.raises(ValueError, match=r"a design is torch\.int64"):
-        region.maximise(bowl, centre=whole[0])
-
-
-def test_a_trust_region_takes_the_corner_of_its_spec_in_any_precision() -> None:
-    region = TrustRegion(SPEC, GradientSearch(SPEC, seed=0), reach=0.5)
-    corner = torch.tensor([LOW, LOW], dtype=torch.float64)
-    assert region.maximise(bowl, centre=corner)[0].dtype == torch.float32
-
-
-def test_bounds_that_bound_nothing_are_refused() -> None:
-    for low, high in ((2.0, 1.0), (0.0, math.inf), (math.nan, 1.0)):
-        with pytest.raises(ValueError, match="are no bounds of a design"):
-            GradientSearch(Bounded(low=torch.tensor([low, 0.0]), high=torch.tensor([high, 1.0]), shape=(2,)))
-    with pytest.raises(ValueError, match="is not the bounds of one design"):
-        GradientSearch(Composite(design=SPEC))
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda posterior: pickle.loads(pickle.dumps(posterior))])
