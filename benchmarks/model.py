@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from statistics import median
 from typing import Any
 
@@ -9,46 +10,56 @@ import torch
 
 from benchmarks.effort import Effort
 from benchmarks.floors import alone, imagination_products
-from benchmarks.measure import Figure, Target, interleaved, over
+from benchmarks.measure import Figure, Target, interleaved, over, threads
 from benchmarks.parts import body_sizes, dynamics_learner, model_products, random_rows, replay
-from benchmarks.updates import FLOOR, PRODUCTS_BY
+from benchmarks.updates import FLOOR, PRODUCTS_BY, plural, too_few_cores
 from coim import HalfCheetahMorph, NoisyDesigns, WorldModelEnv, imagine, make_policy, sample_batches
+from coim.experiments.run.machine import available_cores
 from coim.imagination import CHUNK_ROWS
 from coim.learners.flat_weights import Precision
 from coim.products import chosen
 
 
 def ensemble(effort: Effort) -> list[Figure]:
-    """Sampling, gradients and Adam of the three members, one thread."""
+    """Sampling, gradients and Adam of the three members."""
+    found = []
+    for count in effort.threads:
+        if count > available_cores():
+            found.append(Figure(row=f"ensemble update, {plural(count)}", against=FLOOR, note=too_few_cores(count)))
+            continue
+        with threads(count):
+            found += _ensemble(effort, count)
+    return found
+
+
+def _ensemble(effort: Effort, count: int) -> list[Figure]:
     updates = max(1, effort.updates // 4)
     buffer, listed = replay(1), model_products(effort)
 
-    def ours(precision: Precision) -> Any:
-        learner = dynamics_learner(effort, precision=precision)
+    def ours(precision: Precision = "float32", *, compile: bool = True) -> Callable[[], object]:
+        learner = dynamics_learner(effort, precision=precision, compile=compile)
         return lambda: learner.update(
             sample_batches(buffer, batch_size=effort.batch_size, num_batches=updates)[:, :, 0]
         )
 
-    times = interleaved(
-        {
-            "floor": alone(listed, times=updates),
-            "coim": alone(listed, times=updates, by=chosen()),
-            "float32": ours("float32"),  # as without compiling: native code does not pay for layers as wide as these
-            "bfloat16": ours("bfloat16"),
-        },
-        effort.repeats,
-    )
+    candidates = {
+        "float32": ours(),
+        "float32, not compiled": ours(compile=False),
+        "bfloat16": ours("bfloat16"),
+    }
+    floors = {"floor": alone(listed, times=updates), "products": alone(listed, times=updates, by=chosen())}
+    times = interleaved(floors | candidates, effort.repeats)
     return [
         Figure(
-            row=f"ensemble update, 1 thread, {name}",
+            row=f"ensemble update, {plural(count)}, {name}",
             against=FLOOR,
             ratios=over(times[name], times["floor"]),
             amounts=tuple(1e3 * seconds / updates for seconds in times[name]),
             unit="ms",
             target=Target(1.4) if name == "float32" else None,
-            note=PRODUCTS_BY.format(median(over(times[name], times["coim"]))) if name == "float32" else "",
+            note=PRODUCTS_BY.format(median(over(times[name], times["products"]))) if name == "float32" else "",
         )
-        for name in ("float32", "bfloat16")
+        for name in candidates
     ]
 
 

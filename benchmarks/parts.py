@@ -91,9 +91,9 @@ def sac_learner(
     )
 
 
-def dynamics_learner(effort: Effort, *, precision: Precision = "float32") -> DynamicsLearner:
+def dynamics_learner(effort: Effort, *, precision: Precision = "float32", compile: bool = True) -> DynamicsLearner:
     """A fresh ensemble that has seen the scale of random rows."""
     ensemble = GaussianEnsemble.for_env(HalfCheetahMorph(seed=0), num_cells=effort.model_cells)
-    learner = DynamicsLearner(ensemble, precision=precision, compile=True)
+    learner = DynamicsLearner(ensemble, precision=precision, compile=compile)
     learner.observe(random_rows(REPLAY_ROWS))
     return learner

@@ -71,26 +71,37 @@ def _update(effort: Effort, count: int, runs: int) -> list[Figure]:
 
 def together(effort: Effort) -> list[Figure]:
     """Small networks: several runs that one learner updates, against one run at a time."""
-    effort, runs = dataclasses.replace(effort, num_cells=SMALL), effort.together
-    with threads(1):
-        buffers = {count: replay(count) for count in (1, runs)}
-        times = interleaved(
-            {"floor": alone(update_products(effort), times=effort.updates)}
-            | {
-                f"{count}, {way}": our_updates(buffer, effort, effort.updates, num_runs=count, compile=way == COMPILED)
-                for count, buffer in buffers.items()
-                for way in (COMPILED, EAGER)
-            },
-            effort.repeats,
-        )
+    found = []
+    for count in effort.threads:
+        if count > available_cores():
+            row = f"update of {small_networks()}, {plural(count)}, K = {effort.together}"
+            found.append(Figure(row=row, against="runs, one at a time", note=too_few_cores(count)))
+            continue
+        with threads(count):
+            found += _together(dataclasses.replace(effort, num_cells=SMALL), count)
+    return found
+
+
+def _together(effort: Effort, count: int) -> list[Figure]:
+    together = effort.together
+    buffers = {runs: replay(runs) for runs in (1, together)}
+    times = interleaved(
+        {"floor": alone(update_products(effort), times=effort.updates)}
+        | {
+            f"{runs}, {way}": our_updates(buffer, effort, effort.updates, num_runs=runs, compile=way == COMPILED)
+            for runs, buffer in buffers.items()
+            for way in (COMPILED, EAGER)
+        },
+        effort.repeats,
+    )
     alone_ms = {way: median(times[f"1, {way}"]) / effort.updates * 1e3 for way in (COMPILED, EAGER)}
     floor = median(over(times[f"1, {COMPILED}"], times["floor"]))
     return [
         Figure(
-            row=f"update of {small_networks()}, {plural(1)}, K = {runs}, float32{suffix}",
-            against=f"{runs} runs, one at a time",
-            ratios=tuple(ratio / runs for ratio in over(times[f"{runs}, {way}"], times[f"1, {way}"])),
-            amounts=tuple(1e3 * seconds / (effort.updates * runs) for seconds in times[f"{runs}, {way}"]),
+            row=f"update of {small_networks()}, {plural(count)}, K = {together}, float32{suffix}",
+            against=f"{together} runs, one at a time",
+            ratios=tuple(ratio / together for ratio in over(times[f"{together}, {way}"], times[f"1, {way}"])),
+            amounts=tuple(1e3 * seconds / (effort.updates * together) for seconds in times[f"{together}, {way}"]),
             unit="ms per run",
             target=Target(0.4) if way == COMPILED else None,
             note=f"one alone takes {alone_ms[way]:.2f} ms" + (f", {floor:.2f} x floor" if way == COMPILED else ""),

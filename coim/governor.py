@@ -127,7 +127,17 @@ class Governor:
         return dict(self._state)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on from what was measured."""
+        """Go on from what was measured.
+
+        Raises:
+            ValueError: if it was measured of another number of runs; nothing is changed then.
+        """
+        for name, own in self._state.items():
+            if state_dict[name].shape != own.shape:
+                raise ValueError(
+                    f"the state was measured of {len(state_dict[name])} run(s), the ensemble has {len(own)}; make it "
+                    "with the number of runs that the state was saved with"
+                )
         self._state = {name: state_dict[name].clone() for name in self._state}
 
     def _error(self) -> Tensor:

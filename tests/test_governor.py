@@ -107,6 +107,14 @@ def test_what_was_measured_is_a_state() -> None:
     assert other.earns()
 
 
+def test_a_state_of_another_number_of_runs_is_refused_and_changes_nothing() -> None:
+    one, three = governor(1), governor(3)
+    one.observe(torch.tensor([0.4]), first=True)
+    with pytest.raises(ValueError, match=r"measured of 3 run\(s\), the ensemble has 1"):
+        one.load_state_dict(three.state_dict())
+    assert one.shares(0.2).tolist() == pytest.approx([0.125])
+
+
 def test_what_is_told_is_kept_and_the_teller_may_write_over_it() -> None:
     governed, error = governor(2), torch.tensor([0.1, 0.1])
     governed.observe(error, first=True)

@@ -67,11 +67,11 @@ class ParticleSwarm:
         w: inertia, the share of its velocity that a particle keeps.
         bounds: what happens to a particle outside of the design space: ``"nearest"`` clips it to the edge,
             ``"periodic"`` lets it enter on the other side.
-        seed: seed of the swarm's random numbers; None takes a random one.
+        seed: seed of the swarm's random numbers, from 0 to 2**32 - 1; None takes a random one.
 
     Raises:
-        ValueError: if ``spec`` is not one bounded design, a number of particles or iterations is below 1, or ``bounds``
-            is an unknown option.
+        ValueError: if ``spec`` is not one bounded design, a number of particles or iterations is below 1, ``bounds`` is
+            an unknown option, or ``seed`` is out of its range.
 
     Note:
         The swarm replaces numpy's global state while it moves. Another thread that draws from it at that time gets
@@ -101,6 +101,8 @@ class ParticleSwarm:
             raise ValueError(f"{num_particles} particles x {num_iterations} iterations: both must be at least 1")
         if bounds not in ("nearest", "periodic"):
             raise ValueError(f"bounds={bounds!r} is an unknown option; take 'nearest' or 'periodic'")
+        if seed is not None and not 0 <= seed < 2**32:
+            raise ValueError(f"seed={seed} is outside 0 .. {2**32 - 1}, which numpy takes; pass seed % 2**32")
         self.spec = spec
         self._low, self._high = bounds_of(spec)
         self.bounds = bounds

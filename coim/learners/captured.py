@@ -62,15 +62,16 @@ class FlatAdam(torch.optim.Adam):
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weights), torch.zeros_like(weights)
         return state
 
-    def as_native(self, targets: Tensor, tau: float) -> AdamStep:
+    def as_native(self, targets: Tensor | None = None, tau: float = 1.0) -> AdamStep:
         """The next step as native code takes it; it does not count it.
 
         Args:
-            targets: flat, they follow the last weights.
+            targets: flat, they follow the last weights; None if there are none.
             tau: share of the weights that moves into them.
         """
         (group,) = self.param_groups
         (weights,), moments = group["params"], self.moments()
+        targets = weights[:0] if targets is None else targets
         for name in ("exp_avg", "exp_avg_sq"):
             check_tensor(name, moments[name], tuple(weights.shape), weights.dtype)
         return AdamStep(

@@ -8,17 +8,19 @@ Shapes: N weights, K runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from coim.compiling import Compiled
-from coim.learners.captured import FlatUpdates
+from coim.learners.captured import FlatAdam, FlatUpdates
 from coim.objectives.native_gradients import pays
+from coim.objectives.native_structures import AdamStep
 
 Precision = Literal["float32", "bfloat16"]
+AT_ONCE = 50  # native updates of all networks in a call: only between calls does Python hear Ctrl-C
 WAY_OUT = (
     "make it with the hidden units, the number of critics or members and the number of runs that the state was saved "
     "with"
@@ -39,6 +41,7 @@ class FlatLearner:
         precision: ``"bfloat16"`` has the products read a copy of the weights in bfloat16; the weights stay as they are.
         compile: compute the gradients by compiled code, made in the first update: native code on a CPU, where it is
             known to be faster, see `coim.objectives.native_gradients.pays`; elsewhere that of `torch.compile`.
+        of_ensemble: whether the network is an ensemble, whose layers may be wider there.
 
     Attributes:
         num_runs: K, or None.
@@ -71,6 +74,7 @@ class FlatLearner:
         num_runs: int | None,
         precision: Precision,
         compile: bool,
+        of_ensemble: bool = False,
     ) -> None:
         if precision not in get_args(Precision):
             raise ValueError(f"precision={precision!r} is unknown; choose 'float32' or 'bfloat16'")
@@ -84,7 +88,9 @@ class FlatLearner:
         self._updates = FlatUpdates(self._update_once, self._weights, lr=lr, weight_decay=weight_decay)
         self.optimiser = self._updates.optimiser
         on_cpu = self._weights.device.type == "cpu"
-        self.native = compile and on_cpu and precision == "float32" and pays(self._parameters())
+        self.native = (
+            compile and on_cpu and precision == "float32" and pays(self._parameters(), of_ensemble=of_ensemble)
+        )
         self._compiled = Compiled(gradients) if compile and not on_cpu else None
         self._plain: Callable[..., Any] = gradients
         self._code: dict[int, Any] = {}  # while updates are done
@@ -137,6 +143,27 @@ class FlatLearner:
             return self._updates.mean(batches)
         finally:
             self._code.clear()
+
+    def _all_native(self) -> bool:
+        """Whether native code does all that an update does."""
+        return self.native and isinstance(self.optimiser, FlatAdam) and self.optimiser.is_plain()
+
+    def _native_calls(
+        self, rows: Iterable[Tensor], networks: int, **following: Any
+    ) -> Iterator[tuple[tuple[Tensor, ...], AdamStep]]:
+        """Cut the rows ``[U, ...]`` of updates into those of one call, each with the step of Adam that it begins with.
+
+        Args:
+            rows: of all updates.
+            networks: how many a call updates.
+            following: targets, see `FlatAdam.as_native`.
+        """
+        assert isinstance(self.optimiser, FlatAdam)
+        self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
+        for part in zip(*(x.split(max(1, AT_ONCE // networks)) for x in rows)):
+            step = self.optimiser.as_native(**following)
+            self.optimiser.moments()["step"] += len(part[0])  # first: Ctrl-C is heard when the call is over
+            yield part, step
 
     def _find(self, *inputs: Any, **settings: Any) -> Any:
         """Call the gradients, compiled by `torch.compile` or not."""

@@ -22,19 +22,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from coim.learners.captured import FlatAdam
 from coim.learners.flat_weights import FlatLearner, Precision, in_precision, share_storage, views
 from coim.learners.known_networks import check_exchangeable, check_sac_networks
 from coim.learners.rows import check_sac_rows, on_device, sac_batch
 from coim.models.policy import LOG_SCALE_RANGE, Policy
 from coim.models.qvalue import QValue
 from coim.objectives.gradients import Batch, Network, sac_gradients
-from coim.objectives.native_gradients import NativeSAC, native_updates
+from coim.objectives.native_gradients import NativeSAC, sac_updates
 from coim.objectives.runs import by_update
 from coim.objectives.sac import CoImSACLoss
 from coim.randomness import restore_generator
-
-AT_ONCE = 50  # native updates of all runs in a call: only between calls does Python hear Ctrl-C
 
 
 class SACLearner(FlatLearner):
@@ -51,7 +48,7 @@ class SACLearner(FlatLearner):
         num_runs: K when the networks are stacked along the run axis.
         precision: ``"bfloat16"`` computes the networks' products in bfloat16; weights, moments, targets and losses
             stay as they are.
-        compile: compute the gradients by compiled code, made in the first update; results differ by rounding. On a CPU
+        compile: compute the updates by compiled code, made in the first one; results differ by rounding. On a CPU
             that is native code, for weights of float32 or float64 and layers up to 256 units; all else there is as
             without.
         seed: seeds the learner's own generator, which draws all noise of the policy.
@@ -180,10 +177,8 @@ class SACLearner(FlatLearner):
 
     def _mean(self, batches: Iterable[Tensor]) -> Tensor:
         """As `FlatLearner._mean`, in one call for many updates where native code does all that an update does."""
-        optimiser = self.optimiser
-        if not (self.native and isinstance(optimiser, FlatAdam) and optimiser.is_plain()):
+        if not self._all_native():
             return super()._mean(batches)
-        self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
         rows, found = Batch(*batches), []
         threads = torch.get_num_threads()
         runs = [
@@ -192,10 +187,8 @@ class SACLearner(FlatLearner):
             )
             for run, (networks, own) in enumerate(zip(self._networks, self._gradients))
         ]
-        for part in zip(*(x.split(max(1, AT_ONCE // len(runs))) for x in rows)):
-            step = optimiser.as_native(self._targets, self.tau)
-            optimiser.moments()["step"] += len(part[0])  # first: Ctrl-C is heard when the call is over
-            found.append(native_updates(runs, Batch(*part), step, alpha=float(self.loss.alpha), gamma=self.loss.gamma))
+        for part, step in self._native_calls(rows, len(runs), targets=self._targets, tau=self.tau):
+            found.append(sac_updates(runs, Batch(*part), step, alpha=float(self.loss.alpha), gamma=self.loss.gamma))
         return torch.cat(found).mean(0).mT
 
     def _update_once(self, *rows: Tensor) -> Tensor:

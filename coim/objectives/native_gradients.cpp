@@ -1,6 +1,6 @@
 // The gradients of gradients.py and dynamics_gradients.py for one network (or one policy with its critics) on a CPU, in one
-// call, up to rounding. Compiled by coim/native.py and called by native_gradients.py, whose structures are those of here and
-// of native_networks.h.
+// call, up to rounding; or whole updates by Adam. Compiled by coim/native.py and called by native_gradients.py, whose structures
+// are those of here, of native_networks.h and of native_adam.h.
 //
 // Shapes: B batch, S observation, D design, A action, F inputs of a layer.
 
@@ -42,10 +42,10 @@ struct Desk {
 };
 
 template <class T>
-int64_t sac(const Sac& s) {
+int64_t sac(const Sac& s, const Step<T>* step = nullptr) {
   Room<T> room{static_cast<T*>(s.scratch)};
   const int64_t block = block_of(s.batch, s.threads, BLOCK), blocks = (s.batch + block - 1) / block;
-  const Weights<T> weights{s.batch, block, s.threads, s.team};
+  const Weights<T> weights{s.batch, block, s.threads, s.team, step};
   Packing<T> policy = packing(room, s.policy, s.policy_layers, true);
   std::vector<Packing<T>> critics, targets;
   std::vector<Trace<T>> stored;
@@ -259,11 +259,13 @@ struct Moments {
 };
 
 template <class T>
-int64_t dynamics(const Dynamics& d) {
+int64_t dynamics(const Dynamics& d, const Step<T>* step = nullptr) {
   Room<T> room{static_cast<T*>(d.scratch)};
-  const int64_t block = block_of(d.batch, d.threads, BLOCK), blocks = (d.batch + block - 1) / block;
+  bool wide = false;
+  for (int64_t l = 0; l < d.layers; ++l) wide = wide || d.layer[l].inputs * d.layer[l].outputs > WIDE;
+  const int64_t block = block_of(d.batch, d.threads, wide ? 2 * BLOCK : BLOCK), blocks = (d.batch + block - 1) / block;
   const Packing<T> network = packing(room, d.layer, d.layers, true);
-  const Weights<T> weights{d.batch, block, d.threads, d.team};
+  const Weights<T> weights{d.batch, block, d.threads, d.team, step};
   const Trace<T> all = trace(room, weights.rows(), d.layer, d.layers, true, true);
   const int64_t F = network.front().inputs, S = network.back().outputs / 2;
   std::vector<Moments<T>> desks;
@@ -316,66 +318,35 @@ int64_t dynamics(const Dynamics& d) {
 
 }  // namespace
 
-// ---- Adam and the targets, over flat buffers.
-
-struct Adam {
-  void *weights, *gradient, *first, *second;  // [count]: moments
-  void* targets;                              // [followed], of the last weights
-  int64_t count, followed;
-  double lr, beta1, beta2, eps, decay, tau;
-  bool decoupled;                             // AdamW's decay
-  double steps;                               // done before
-};
+// ---- Updates, with rows [updates, runs, B, ...] of which the structures have the first ones.
 
 namespace {
 
-// As torch.optim.Adam and torchrl's SoftUpdate have it, up to rounding.
 template <class T>
-void adam_step(const Adam& all, int64_t from, int64_t to, double steps) {
-  T* __restrict weights = static_cast<T*>(all.weights);
-  T* __restrict first = static_cast<T*>(all.first);
-  T* __restrict second = static_cast<T*>(all.second);
-  const T* __restrict gradient = static_cast<const T*>(all.gradient);
-  const T step = all.lr / (1 - std::pow(all.beta1, steps)), root = std::sqrt(1 - std::pow(all.beta2, steps));
-  const T kept = all.decoupled ? 1 - all.lr * all.decay : 1, decay = all.decoupled ? 0 : all.decay;
-  const T one = 1 - all.beta1, other = 1 - all.beta2, beta2 = all.beta2, eps = all.eps;
-  for (int64_t i = from; i < to; ++i) {
-    const T g = gradient[i] + decay * weights[i];
-    first[i] += one * (g - first[i]);
-    second[i] = beta2 * second[i] + other * g * g;
-    weights[i] = kept * weights[i] - step * first[i] / (std::sqrt(second[i]) / root + eps);
-  }
-  T* __restrict targets = static_cast<T*>(all.targets);
-  const T tau = all.tau;
-  const int64_t before = all.count - all.followed;
-  for (int64_t i = std::max(from, before); i < to; ++i) {  // from the nearer end, as torch.lerp: tau = 1 copies
-    const T target = targets[i - before], way = weights[i] - target;
-    targets[i - before] = tau < T(0.5) ? target + tau * way : weights[i] - (1 - tau) * way;
-  }
+int64_t sac_updates(const Sac* runs, int64_t num_runs, int64_t updates, const Adam& all, T* scratch) {
+  return updates_of<T>(runs, num_runs, updates, all, scratch, [&](Sac s, int64_t u, const Step<T>* step) {
+    const int64_t rows = u * num_runs * s.batch;
+    const auto move = [&](const void*& part, int64_t width) { part = static_cast<const T*>(part) + rows * width; };
+    for (const void** part : {&s.observation, &s.next_observation}) move(*part, s.observed);
+    for (const void** part : {&s.action, &s.noise, &s.next_noise}) move(*part, s.acted);
+    for (const void** part : {&s.reward, &s.weight}) move(*part, 1);
+    move(s.design, s.designed);
+    s.terminated += rows;
+    s.losses = static_cast<T*>(s.losses) + 3 * num_runs * u;
+    return sac<T>(s, step);
+  });
 }
 
-// Updates with rows [updates, runs, B, ...], of which the structures have the first ones.
+// The members of all runs, one run after the other; those of a run have its rows.
 template <class T>
-void sac_updates(const Sac* runs, int64_t num_runs, int64_t updates, const Adam& all) {
-  constexpr int64_t SHARE = 1 << 14;  // of the weights, for one task
-  const int64_t shares = (all.count + SHARE - 1) / SHARE;
-  for (int64_t u = 0; u < updates; ++u) {
-    for (int64_t run = 0; run < num_runs; ++run) {
-      Sac s = runs[run];
-      const int64_t rows = u * num_runs * s.batch;
-      const auto move = [&](const void*& part, int64_t width) { part = static_cast<const T*>(part) + rows * width; };
-      for (const void** part : {&s.observation, &s.next_observation}) move(*part, s.observed);
-      for (const void** part : {&s.action, &s.noise, &s.next_noise}) move(*part, s.acted);
-      for (const void** part : {&s.reward, &s.weight}) move(*part, 1);
-      move(s.design, s.designed);
-      s.terminated += rows;
-      s.losses = static_cast<T*>(s.losses) + 3 * num_runs * u;
-      sac<T>(s);
-    }
-    spread(runs->team, runs->threads, shares, [&](int64_t task, int64_t) {
-      adam_step<T>(all, task * SHARE, std::min((task + 1) * SHARE, all.count), all.steps + u + 1);
-    });
-  }
+int64_t dynamics_updates(const Dynamics* members, int64_t count, int64_t num_runs, int64_t updates, const Adam& all, T* scratch) {
+  return updates_of<T>(members, count, updates, all, scratch, [&](Dynamics d, int64_t u, const Step<T>* step) {
+    const int64_t rows = u * num_runs * d.batch;
+    d.x = static_cast<const T*>(d.x) + rows * d.layer[0].inputs;
+    d.target = static_cast<const T*>(d.target) + rows * (d.layer[d.layers - 1].outputs / 2);
+    d.loss = static_cast<T*>(d.loss) + count * u;
+    return dynamics<T>(d, step);
+  });
 }
 
 }  // namespace
@@ -383,12 +354,18 @@ void sac_updates(const Sac* runs, int64_t num_runs, int64_t updates, const Adam&
 extern "C" {
 int64_t sac_float(const Sac* s) { return sac<float>(*s); }
 int64_t dynamics_float(const Dynamics* d) { return dynamics<float>(*d); }
-void sac_updates_float(const Sac* runs, int64_t num_runs, int64_t updates, const Adam* all) {
-  sac_updates<float>(runs, num_runs, updates, *all);
+int64_t sac_updates_float(const Sac* runs, int64_t num_runs, int64_t updates, const Adam* all, float* scratch) {
+  return sac_updates<float>(runs, num_runs, updates, *all, scratch);
+}
+int64_t dynamics_updates_float(const Dynamics* members, int64_t count, int64_t num_runs, int64_t updates, const Adam* all, float* scratch) {
+  return dynamics_updates<float>(members, count, num_runs, updates, *all, scratch);
 }
 int64_t sac_double(const Sac* s) { return sac<double>(*s); }
 int64_t dynamics_double(const Dynamics* d) { return dynamics<double>(*d); }
-void sac_updates_double(const Sac* runs, int64_t num_runs, int64_t updates, const Adam* all) {
-  sac_updates<double>(runs, num_runs, updates, *all);
+int64_t sac_updates_double(const Sac* runs, int64_t num_runs, int64_t updates, const Adam* all, double* scratch) {
+  return sac_updates<double>(runs, num_runs, updates, *all, scratch);
+}
+int64_t dynamics_updates_double(const Dynamics* members, int64_t count, int64_t num_runs, int64_t updates, const Adam* all, double* scratch) {
+  return dynamics_updates<double>(members, count, num_runs, updates, *all, scratch);
 }
 }

@@ -1,4 +1,4 @@
-"""Gradients on a CPU by native code: ``native_gradients.cpp``, the same as the written-out ones up to rounding.
+"""Gradients and updates on a CPU by native code, ``native_gradients.cpp``: the written-out ones up to rounding.
 
 `coim.objectives.gradients` and `coim.objectives.dynamics_gradients` say what is computed;
 ``tests/objectives/test_native_gradients.py`` holds the two equal. There every operation goes over the whole batch and
@@ -6,7 +6,7 @@ writes its result to memory. Here a block of rows goes through all networks and 
 and what is multiplied on the way back happen in the registers of a product. The result has the same bits with any
 number of threads.
 
-Shapes: B batch, N critics, S observation, D design, A action, F input features.
+Shapes: U updates, K runs, M members of all runs, B batch, N critics, S observation, D design, A action, F inputs.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import ctypes
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,10 +34,11 @@ from coim.objectives.native_structures import (
     check_tensor,
     layers_of,
 )
+from coim.products import Kind, kind_of_processor
 
 SOURCE = Source(
     path=Path(__file__).with_suffix(".cpp"),
-    headers=(Path(__file__).with_name("native_networks.h"),),
+    headers=(Path(__file__).with_name("native_networks.h"), Path(__file__).with_name("native_adam.h")),
     # -O3 makes nothing faster here, and takes a third longer. Adam needs its loop in vectors, and bare square roots.
     options=("-O2", "-fno-math-errno", "-ffp-contract=fast"),
     wished=("-ftree-loop-vectorize", "-fvect-cost-model=dynamic"),
@@ -44,9 +46,11 @@ SOURCE = Source(
     way_out="set compile=False",
 )
 # AMD EPYC with AVX2, one thread, in multiples of torch.mm's time for the products, native and written out: SAC 3 x 64
-# 0.94 and 2.5, 3 x 200 1.03 and 1.5; a member of an ensemble 3 x 128 1.10 and 1.8, 3 x 256 1.08 and 1.4. Of 3 x 500
-# 1.17 and 1.25, but in an update of three members, whose weights no cache holds, no difference was left.
+# 0.94 and 2.5, 3 x 200 1.03 and 1.5; a member of an ensemble 3 x 128 1.10 and 1.8, 3 x 256 1.08 and 1.4. Whole updates
+# of three members of 3 x 500 1.21 and 1.29, on two threads 1.11 and 1.40. Wider layers were not measured, nor these
+# on other processors.
 UP_TO = 256
+UP_TO_IN_ENSEMBLES: dict[Kind, int] = {"AVX2": 512}
 
 
 @functools.cache
@@ -59,9 +63,10 @@ def library() -> ctypes.CDLL:
     return SOURCE.library()
 
 
-def pays(weights: Sequence[Tensor]) -> bool:
+def pays(weights: Sequence[Tensor], *, of_ensemble: bool = False) -> bool:
     """Whether there is native code for networks with such weights and biases, ``[*, O]``, known to be faster."""
-    return all(part.dtype in NUMBERS and part.shape[-1] <= UP_TO for part in weights)
+    most = UP_TO_IN_ENSEMBLES.get(kind_of_processor(), UP_TO) if of_ensemble else UP_TO
+    return all(part.dtype in NUMBERS and part.shape[-1] <= most for part in weights)
 
 
 class NativeSAC:
@@ -125,7 +130,7 @@ class NativeSAC:
         self.check(batch)
         split = [len(policy.weights) * 2, *(len(critic.weights) * 2 for critic in critics)]
         own, *of_critics = (list(part) for part in _split(gradients, split))
-        self._call = Call(
+        self.call = Call(
             library(),
             "sac",
             weights,
@@ -155,13 +160,13 @@ class NativeSAC:
             alpha: entropy temperature.
             gamma: discount.
         """
-        struct = self._call.struct
+        struct = self.call.struct
         for name, rows in zip(self._shapes, batch):
             setattr(struct, name, rows.data_ptr())
         struct.alpha, struct.gamma = alpha, gamma
-        losses = self._call.result(3)
+        losses = self.call.result(3)
         struct.losses = losses.data_ptr()
-        self._call()
+        self.call()
         return losses
 
     def check(self, batch: Batch, *lead: int) -> None:
@@ -170,8 +175,10 @@ class NativeSAC:
             check_tensor(name, rows, (*lead, *shape), torch.bool if name == "terminated" else self._dtype)
 
 
-def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, alpha: float, gamma: float) -> Tensor:
+def sac_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, alpha: float, gamma: float) -> Tensor:
     """Compute gradients of all runs, do one step of Adam and move the targets, for one batch after the other.
+
+    With several threads each takes runs of its own, as far as there are enough of them.
 
     Args:
         runs: K of them, of the same sizes, with gradients in one flat buffer that ``step`` reads.
@@ -187,14 +194,13 @@ def native_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, al
         ValueError: if rows have another shape or dtype, or are not contiguous.
     """
     runs[0].check(rows, len(rows.reward), len(runs))
-    structs = (Sac * len(runs))(*(run._call.struct for run in runs))
-    losses = rows.reward.new_empty(len(rows.reward), len(runs), 3)
+    structs = (Sac * len(runs))(*(run.call.struct for run in runs))
+    losses = runs[0].call.result(len(rows.reward), len(runs), 3)
     for k, struct in enumerate(structs):
         for name, part in zip(Batch._fields, rows):
             setattr(struct, name, part[0, k].data_ptr())
         struct.alpha, struct.gamma, struct.losses = alpha, gamma, losses[0, k].data_ptr()
-    function = getattr(library(), f"sac_updates_{NUMBERS[losses.dtype]}")
-    function(structs, ctypes.c_int64(len(runs)), ctypes.c_int64(len(losses)), ctypes.byref(step))
+    _updates("sac_updates", runs[0].call, [structs, len(runs), len(losses)], step, losses.dtype)
     return losses
 
 
@@ -232,9 +238,9 @@ class NativeDynamics:
         check_counts(size, threads)
         check_network("ensemble", network, features, 2 * entries, weights)
         check_gradients([network], gradients)
-        check_tensor("x", x, (size, features), weights.dtype)
-        check_tensor("target", target, (size, entries), weights.dtype)
-        self._call = Call(
+        self._shapes, self._dtype = ((size, features), (size, entries)), weights.dtype
+        self.check(x, target)
+        self.call = Call(
             library(),
             "dynamics",
             weights,
@@ -256,11 +262,55 @@ class NativeDynamics:
             x: contiguous, of the shape and dtype of the first one.
             target: likewise.
         """
-        struct = self._call.struct
-        loss = self._call.result(1)
+        struct = self.call.struct
+        loss = self.call.result(1)
         struct.x, struct.target, struct.loss = x.data_ptr(), target.data_ptr(), loss.data_ptr()
-        self._call()
+        self.call()
         return loss
+
+    def check(self, x: Tensor, target: Tensor, *lead: int) -> None:
+        """Refuse rows of other shapes or dtypes than the first ones, with these dimensions before them."""
+        for name, rows, shape in zip(("x", "target"), (x, target), self._shapes):
+            check_tensor(name, rows, (*lead, *shape), self._dtype)
+
+
+def dynamics_updates(members: Sequence[NativeDynamics], x: Tensor, target: Tensor, step: AdamStep) -> Tensor:
+    """Compute gradients of all members and do one step of Adam, for one batch after the other.
+
+    With several threads each takes members of its own, as far as there are enough of them.
+
+    Args:
+        members: M of them, of the same sizes, those of one run after those of the other, with gradients in one flat
+            buffer that ``step`` reads.
+        x: contiguous inputs, ``[U, K, B, F]``, of the dtype of those that the members were made with.
+        target: likewise, ``[U, K, B, S]``.
+        step: without targets; its count of steps is not changed.
+
+    Returns:
+        J_p of Eq. 6 for each member, ``[U, M]``.
+
+    Raises:
+        ValueError: if rows have another shape or dtype, or are not contiguous.
+    """
+    updates, runs = x.shape[:2]
+    members[0].check(x, target, updates, runs)
+    structs = (Dynamics * len(members))(*(member.call.struct for member in members))
+    losses = members[0].call.result(updates, len(members))
+    for m, struct in enumerate(structs):
+        run = m * runs // len(members)
+        struct.x, struct.target = x[0, run].data_ptr(), target[0, run].data_ptr()
+        struct.loss = losses[0, m].data_ptr()
+    _updates("dynamics_updates", members[0].call, [structs, len(members), runs, updates], step, losses.dtype)
+    return losses
+
+
+def _updates(name: str, call: Call, arguments: Sequence[Any], step: AdamStep, dtype: torch.dtype) -> None:
+    """Call a function that asks for memory if it is given none."""
+    function = getattr(library(), f"{name}_{NUMBERS[dtype]}")
+    function.restype = ctypes.c_int64
+    given = [ctypes.c_int64(one) if isinstance(one, int) else one for one in arguments]
+    needed = function(*given, ctypes.byref(step), None)
+    function(*given, ctypes.byref(step), ctypes.c_void_p(call.memory(needed)))
 
 
 def _split(tensors: Sequence[Tensor], counts: Sequence[int]) -> list[Sequence[Tensor]]:

@@ -8,6 +8,8 @@
 
 #pragma once
 
+#include "native_adam.h"
+
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -26,6 +28,7 @@ constexpr int BYTES = 64, TILE_ROWS = 8;
 constexpr int BYTES = 32, TILE_ROWS = 6;
 #endif
 constexpr int64_t BLOCK = 132;  // about so many rows go through the networks together
+constexpr int64_t WIDE = 1 << 17;  // of more numbers than this in a layer, twice as many: its gradient leaves the cache
 constexpr int64_t DEPTH = 128;  // products that a tile sums at once of a copied panel; of others twice as many
 constexpr int64_t LINE = 64;    // bytes of a line of the cache
 
@@ -436,13 +439,14 @@ struct Part {
   Matrix<T> values, deltas;
   int64_t from, to;
 
-  // Of so many rows; `adds` to what others gave.
-  void compute(int64_t rows, bool adds) const {
+  // Of so many rows; `adds` to what others gave. With a step Adam takes it.
+  void compute(int64_t rows, bool adds, const Step<T>* step) const {
     const int64_t columns = layer->outputs;
     const Matrix<T> gradient{static_cast<T*>(layer->weight_gradient) + from * columns, columns};
     Product<T> product{to - from, columns, rows, values.data + from, 1, values.stride, deltas.data, 1, deltas.stride, gradient};
     product.adds = adds, product.narrow = true;
     product.compute();
+    if (step != nullptr) step->of(gradient.data, (to - from) * columns);
     if (from > 0) return;
     T* bias = static_cast<T*>(layer->bias_gradient);
     if (!adds) std::fill_n(bias, columns, T(0));
@@ -450,15 +454,18 @@ struct Part {
       const T* delta = deltas.row(row);
       for (int64_t j = 0; j < columns; ++j) bias[j] += delta[j];
     }
+    if (step != nullptr) step->of(bias, columns);
   }
 };
 
 // The weight gradients of networks: one thread takes them from each block of rows while it is in the cache, and needs room
-// for one block. Several take them in the end. Both sum the rows in their order.
+// for one block. Several take them in the end. Both sum the rows in their order. A step, if there is one, changes weights as
+// soon as their gradients are whole: the networks have been packed, and no one reads the weights themselves any more.
 template <class T>
 struct Weights {
   int64_t batch, block, threads;
   Team team;
+  const Step<T>* step;
 
   bool at_once() const { return threads <= 1 || team == nullptr; }
   int64_t rows() const { return at_once() ? block : batch; }
@@ -466,8 +473,10 @@ struct Weights {
 
   void of_block(const Packing<T>& network, const Trace<T>& trace, int64_t first, int64_t rows) const {
     if (!at_once()) return;
+    const bool last = first + rows == batch;
     for (size_t l = network.size(); l-- > 0;) {
-      Part<T>{network[l].layer, trace.values[l], trace.deltas[l], 0, network[l].inputs}.compute(rows, first > 0);
+      const Part<T> whole{network[l].layer, trace.values[l], trace.deltas[l], 0, network[l].inputs};
+      whole.compute(rows, first > 0, last ? step : nullptr);
     }
   }
 
@@ -483,9 +492,37 @@ struct Weights {
         }
       }
     }
-    spread(team, threads, parts.size(), [&](int64_t task, int64_t) { parts[task].compute(batch, false); });
+    spread(team, threads, parts.size(), [&](int64_t task, int64_t) { parts[task].compute(batch, false, step); });
   }
 };
+
+// Updates of networks that know nothing of each other, each with rows of its own: as many networks at once as there are
+// threads, all updates of one after the other, so that its weights stay in the cache; what is left over by all threads
+// together. Nobody's bits depend on that.
+//
+// `once` computes the gradients of one of the structures, moved to the rows of an update, in its memory, with a step of Adam;
+// without memory it counts. Returned is how many numbers are needed in `scratch`; if that is null, nothing is done.
+template <class T, class Networks, class Once>
+int64_t updates_of(const Networks* all, int64_t count, int64_t updates, const Adam& adam, T* scratch, Once once) {
+  const int64_t threads = all->team == nullptr ? 1 : all->threads, apart = count / threads * threads;
+  const auto with = [](Networks networks, int64_t threads, T* memory) {
+    networks.threads = threads, networks.scratch = memory;
+    if (threads == 1) networks.team = nullptr;
+    return networks;
+  };
+  const int64_t room = once(with(*all, 1, nullptr), 0, nullptr);
+  const int64_t together = apart == count ? 0 : once(with(*all, threads, nullptr), 0, nullptr);
+  if (scratch == nullptr) return std::max(std::min(threads, apart) * room, together);
+  const auto update = [&](const Networks& networks) {
+    for (int64_t u = 0; u < updates; ++u) {
+      const Step<T> step(adam, adam.steps + u + 1);
+      once(networks, u, &step);
+    }
+  };
+  spread(all->team, threads, apart, [&](int64_t n, int64_t worker) { update(with(all[n], 1, scratch + worker * room)); });
+  for (int64_t n = apart; n < count; ++n) update(with(all[n], threads, scratch));
+  return 0;
+}
 
 template <class T>
 void copy_row(T* to, std::initializer_list<std::pair<const T*, int64_t>> parts) {

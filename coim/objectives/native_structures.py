@@ -59,7 +59,7 @@ class Dynamics(ctypes.Structure):
 
 
 class AdamStep(ctypes.Structure):
-    """Adam over flat buffers, and targets that follow the last weights; as ``Adam`` in the source."""
+    """Adam over flat buffers, and targets that follow the last weights; as ``Adam`` in ``native_adam.h``."""
 
     _fields_: ClassVar[Any] = (
         [(name, ctypes.c_void_p) for name in ("weights", "gradient", "first", "second", "targets")]
@@ -79,15 +79,21 @@ class Call:
         function.restype = ctypes.c_int64
         self.struct: Any = struct
         self._function, self._at, self._like = function, ctypes.byref(struct), weights
-        line = 64 // weights.element_size()  # of the processor's cache, where the memory begins
-        self._scratch = weights.new_zeros(function(self._at) + line)
-        struct.scratch = (self._scratch.data_ptr() + 63) // 64 * 64
+        self._scratch = weights.new_zeros(0)
 
     def __call__(self) -> None:
+        if not self.struct.scratch:
+            self.struct.scratch = self.memory(self._function(self._at))
         self._function(self._at)
 
-    def result(self, numbers: int) -> Tensor:
-        return self._like.new_empty(numbers)
+    def memory(self, numbers: int) -> int:
+        """Address of memory for so many numbers, which is kept; it begins with a line of the processor's cache."""
+        if len(self._scratch) < (wanted := numbers + 64 // self._like.element_size()):
+            self._scratch = self._like.new_zeros(wanted)
+        return (self._scratch.data_ptr() + 63) // 64 * 64
+
+    def result(self, *shape: int) -> Tensor:
+        return self._like.new_empty(shape)
 
 
 def layers_of(networks: Sequence[Network], gradients: Sequence[Sequence[Tensor] | None]) -> ctypes.Array[Layer]:

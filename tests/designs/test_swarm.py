@@ -179,6 +179,13 @@ def test_a_swarm_of_nothing_is_refused() -> None:
         ParticleSwarm(SPEC, num_particles=0)
 
 
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_that_numpy_does_not_take_is_refused(seed: int) -> None:
+    with pytest.raises(ValueError, match=rf"seed={seed} is outside 0 \.\. 4294967295"):
+        ParticleSwarm(SPEC, seed=seed)
+    ParticleSwarm(SPEC, seed=seed % 2**32)
+
+
 @pytest.mark.parametrize("bounds", ["nearest", "periodic"])
 def test_an_entry_may_be_held_fixed(bounds: str) -> None:
     spec = Bounded(low=torch.tensor([0.8, 1.2]), high=torch.tensor([2.0, 1.2]), shape=(2,), dtype=torch.float32)

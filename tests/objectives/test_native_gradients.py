@@ -18,8 +18,9 @@ from coim.native import Source, find_compiler, team
 from coim.objectives import native_gradients
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
-from coim.objectives.native_gradients import NativeDynamics, NativeSAC, pays
+from coim.objectives.native_gradients import SOURCE, UP_TO, UP_TO_IN_ENSEMBLES, NativeDynamics, NativeSAC, pays
 from coim.objectives.native_structures import AdamStep, Dynamics, Layer, Sac
+from coim.products import kind_of_processor
 
 CLAMPED = (-0.5, 0.5)  # of the log-scale: some are inside, some outside
 # Sizes of batch, observation, design, action, hidden layers; number of critics.
@@ -246,18 +247,20 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
 def test_wide_layers_are_left_to_the_libraries() -> None:
     assert pays([torch.zeros(1000, 256), torch.zeros(256)])
     assert not pays([torch.zeros(10, 257), torch.zeros(257)])
+    most = UP_TO_IN_ENSEMBLES.get(kind_of_processor(), UP_TO)
+    assert pays([torch.zeros(10, most), torch.zeros(most)], of_ensemble=True)
+    assert not pays([torch.zeros(10, most + 1), torch.zeros(most + 1)], of_ensemble=True)
     assert not pays([torch.zeros(10, 16, dtype=torch.bfloat16), torch.zeros(16, dtype=torch.bfloat16)])
 
 
 def test_the_code_for_other_processors_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A compiler splits vectors that are wider than the processor's, so that the code for AVX-512 runs anywhere."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    source, (header,) = native_gradients.SOURCE.path, native_gradients.SOURCE.headers
-    other = tmp_path / header.name
-    other.write_text(header.read_text().replace("#if defined(__AVX512F__)", "#if !defined(__AVX512F__)"))
-    assert other.read_text() != header.read_text()
-    copy = Path(shutil.copy(source, tmp_path))
-    library = replace(native_gradients.SOURCE, path=copy, headers=(other,)).library()
+    path, *headers = (Path(shutil.copy(one, tmp_path)) for one in (SOURCE.path, *SOURCE.headers))
+    networks = headers[0].read_text()
+    headers[0].write_text(networks.replace("#if defined(__AVX512F__)", "#if !defined(__AVX512F__)"))
+    assert headers[0].read_text() != networks
+    library = replace(SOURCE, path=path, headers=tuple(headers)).library()
     monkeypatch.setattr(native_gradients, "library", lambda: library)
     for sizes in SIZES:
         test_gradients_and_losses_of_sac_equal_the_written_out_ones(sizes, torch.float32)
@@ -276,9 +279,9 @@ def test_the_structures_are_those_of_the_source(tmp_path: Path) -> None:
             checks.append(f"static_assert(offsetof({name}, {field}) == {getattr(structure, field).offset});")
     assert len(checks) == 4 + 6 + 27 + 11 + 15
     file = tmp_path / "check.cpp"
-    file.write_text(f'#include <cstddef>\n#include "{native_gradients.SOURCE.path}"\n' + "\n".join(checks))
-    command, _ = native_gradients.SOURCE.command(find_compiler("install one"))
-    native_gradients.SOURCE.run([*command, "-fsyntax-only", str(file), "-o", os.devnull])
+    file.write_text(f'#include <cstddef>\n#include "{SOURCE.path}"\n' + "\n".join(checks))
+    command, _ = SOURCE.command(find_compiler("install one"))
+    SOURCE.run([*command, "-fsyntax-only", str(file), "-o", os.devnull])
 
 
 def test_nothing_is_written_beside_the_gradients() -> None:
@@ -308,9 +311,9 @@ def test_a_compiler_that_does_not_know_what_is_wished_for_does_without(tmp_path:
         f'exec {find_compiler("install one")} "$@"\n'
     )
     compiler.chmod(0o755)
-    command, _ = native_gradients.SOURCE.command(str(compiler))
-    assert not {*native_gradients.SOURCE.wished} & {*command}
-    assert {*native_gradients.SOURCE.options} <= {*command}
+    command, _ = SOURCE.command(str(compiler))
+    assert not {*SOURCE.wished} & {*command}
+    assert {*SOURCE.options} <= {*command}
 
 
 def test_a_changed_header_is_compiled_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,10 +351,9 @@ def test_each_processor_compiler_option_and_version_has_code_of_its_own(
 
 
 def test_every_header_that_is_included_is_named() -> None:
-    source = native_gradients.SOURCE
     included = [
-        source.path.with_name(name)
-        for path in (source.path, *source.headers)
+        SOURCE.path.with_name(name)
+        for path in (SOURCE.path, *SOURCE.headers)
         for name in re.findall(r'#include "([^"]+)"', path.read_text())
     ]
-    assert included == [*source.headers]
+    assert included == [*SOURCE.headers]

@@ -19,7 +19,7 @@ from coim.experiments.run.machine import check_compiler
     [
         (["--compile"], "native gradients,"),
         (["--compile", "--num-cells", "257"], "native gradients of the model,"),
-        (["--compile", "--model-cells", "257"], "native gradients of policy and critics,"),
+        (["--compile", "--model-cells", "513"], "native gradients of policy and critics,"),
         (["--compile", "--num-cells", "257", "--imagine", "none"], "not compiled,"),
         (["--compile", "--num-cells", "257", "--dream", "simulator"], "not compiled,"),
         ([], "not compiled,"),
