@@ -173,7 +173,7 @@ class DynamicsLearner(FlatLearner):
         if not self._all_native():
             return super()._mean(batches)
         x, target = batches
-        members, threads, found = self.ensemble.num_members, torch.get_num_threads(), []
+        members, threads = self.ensemble.num_members, torch.get_num_threads()
         natives = [
             NativeDynamics(
                 network,
@@ -185,9 +185,10 @@ class DynamicsLearner(FlatLearner):
             )
             for at, (network, own) in enumerate(zip(self._networks, self._gradients))
         ]
-        for (some, wanted), step in self._native_calls((x, target), len(natives)):
-            found.append(dynamics_updates(natives, some, wanted, step))
-        return torch.cat(found).unflatten(-1, (-1, members)).sum(-1).mean(0)
+        losses = self._natively(
+            (x, target), len(natives), lambda part, step: dynamics_updates(natives, part[0], part[1], step)
+        )
+        return losses.unflatten(-1, (-1, members)).sum(-1).mean(0)
 
     def _update_once(self, *rows: Tensor) -> Tensor:
         """Do one update with inputs ``[K, B, F]`` and targets ``[K, B, S]``; return the losses, ``[K]``."""

@@ -8,7 +8,7 @@ Shapes: N weights, K runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from coim.compiling import Compiled
 from coim.learners.captured import FlatAdam, FlatUpdates
 from coim.objectives.native_gradients import pays
-from coim.objectives.native_structures import AdamStep
 
 Precision = Literal["float32", "bfloat16"]
 AT_ONCE = 50  # native updates of all networks in a call: only between calls does Python hear Ctrl-C
@@ -39,13 +38,13 @@ class FlatLearner:
         weight_decay: L2 penalty of Adam.
         num_runs: K when the networks are stacked along the run axis.
         precision: ``"bfloat16"`` has the products read a copy of the weights in bfloat16; the weights stay as they are.
-        compile: compute the gradients by compiled code, made in the first update: native code on a CPU, where it is
+        compile: compute the updates by compiled code, made in the first one: native code on a CPU, where it is
             known to be faster, see `coim.objectives.native_gradients.pays`; elsewhere that of `torch.compile`.
         of_ensemble: whether the network is an ensemble, whose layers may be wider there.
 
     Attributes:
         num_runs: K, or None.
-        native: whether gradients are computed in native code.
+        native: whether gradients are computed in native code, and whole updates with `FlatAdam` as it is.
         optimiser: Adam over the flat buffer. Its settings may be changed at any time; the next update follows.
 
     Raises:
@@ -148,22 +147,30 @@ class FlatLearner:
         """Whether native code does all that an update does."""
         return self.native and isinstance(self.optimiser, FlatAdam) and self.optimiser.is_plain()
 
-    def _native_calls(
-        self, rows: Iterable[Tensor], networks: int, **following: Any
-    ) -> Iterator[tuple[tuple[Tensor, ...], AdamStep]]:
-        """Cut the rows ``[U, ...]`` of updates into those of one call, each with the step of Adam that it begins with.
+    def _natively(
+        self, rows: Iterable[Tensor], networks: int, update: Callable[..., Tensor], **following: Any
+    ) -> Tensor:
+        """Do updates in calls of native code, and return the losses of all of them.
 
         Args:
-            rows: of all updates.
+            rows: ``[U, ...]``, of all updates.
             networks: how many a call updates.
+            update: does those of one call, with its rows and the step of Adam that it begins with; returns losses,
+                ``[U, ...]``.
             following: targets, see `FlatAdam.as_native`.
         """
         assert isinstance(self.optimiser, FlatAdam)
         self._weights.grad = self._gradient  # `optimiser.zero_grad()` takes it away
+        found = []
         for part in zip(*(x.split(max(1, AT_ONCE // networks)) for x in rows)):
-            step = self.optimiser.as_native(**following)
-            self.optimiser.moments()["step"] += len(part[0])  # first: Ctrl-C is heard when the call is over
-            yield part, step
+            step, counted = self.optimiser.as_native(**following), self.optimiser.moments()["step"]
+            counted += len(part[0])  # first: Ctrl-C is heard when the call is over
+            try:
+                found.append(update(part, step))
+            except Exception:  # refused, or no memory: nothing was done
+                counted -= len(part[0])
+                raise
+        return torch.cat(found)
 
     def _find(self, *inputs: Any, **settings: Any) -> Any:
         """Call the gradients, compiled by `torch.compile` or not."""

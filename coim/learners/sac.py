@@ -179,7 +179,7 @@ class SACLearner(FlatLearner):
         """As `FlatLearner._mean`, in one call for many updates where native code does all that an update does."""
         if not self._all_native():
             return super()._mean(batches)
-        rows, found = Batch(*batches), []
+        rows = Batch(*batches)
         threads = torch.get_num_threads()
         runs = [
             NativeSAC(
@@ -187,9 +187,15 @@ class SACLearner(FlatLearner):
             )
             for run, (networks, own) in enumerate(zip(self._networks, self._gradients))
         ]
-        for part, step in self._native_calls(rows, len(runs), targets=self._targets, tau=self.tau):
-            found.append(sac_updates(runs, Batch(*part), step, alpha=float(self.loss.alpha), gamma=self.loss.gamma))
-        return torch.cat(found).mean(0).mT
+        alpha, gamma = float(self.loss.alpha), self.loss.gamma
+        losses = self._natively(
+            rows,
+            len(runs),
+            lambda part, step: sac_updates(runs, Batch(*part), step, alpha=alpha, gamma=gamma),
+            targets=self._targets,
+            tau=self.tau,
+        )
+        return losses.mean(0).mT
 
     def _update_once(self, *rows: Tensor) -> Tensor:
         """Do one update with the rows of a `Batch`, ``[K, B, ...]``; return losses and entropy, ``[3, K]``."""

@@ -28,6 +28,7 @@ from coim.objectives.native_structures import (
     Call,
     Dynamics,
     Sac,
+    check_alike,
     check_counts,
     check_gradients,
     check_network,
@@ -47,8 +48,8 @@ SOURCE = Source(
 )
 # AMD EPYC with AVX2, one thread, in multiples of torch.mm's time for the products, native and written out: SAC 3 x 64
 # 0.94 and 2.5, 3 x 200 1.03 and 1.5; a member of an ensemble 3 x 128 1.10 and 1.8, 3 x 256 1.08 and 1.4. Whole updates
-# of three members of 3 x 500 1.21 and 1.29, on two threads 1.11 and 1.40. Wider layers were not measured, nor these
-# on other processors.
+# of three members of 3 x 500 1.19 and 1.29, on two threads 1.11 and 1.37. All in float32. Wider layers were not
+# measured, nor these on processors with AVX-512.
 UP_TO = 256
 UP_TO_IN_ENSEMBLES: dict[Kind, int] = {"AVX2": 512}
 
@@ -191,10 +192,12 @@ def sac_updates(runs: Sequence[NativeSAC], rows: Batch, step: AdamStep, *, alpha
         Losses of actor and critics, and the entropy, ``[U, K, 3]``.
 
     Raises:
-        ValueError: if rows have another shape or dtype, or are not contiguous.
+        ValueError: if rows have another shape or dtype, or are not contiguous; if the runs differ in their sizes, or a
+            gradient is not of that buffer.
     """
     runs[0].check(rows, len(rows.reward), len(runs))
     structs = (Sac * len(runs))(*(run.call.struct for run in runs))
+    check_alike([*structs], step, rows.reward.dtype)
     losses = runs[0].call.result(len(rows.reward), len(runs), 3)
     for k, struct in enumerate(structs):
         for name, part in zip(Batch._fields, rows):
@@ -290,11 +293,15 @@ def dynamics_updates(members: Sequence[NativeDynamics], x: Tensor, target: Tenso
         J_p of Eq. 6 for each member, ``[U, M]``.
 
     Raises:
-        ValueError: if rows have another shape or dtype, or are not contiguous.
+        ValueError: if rows have another shape or dtype, or are not contiguous; if the members differ in their sizes or
+            are not as many for each run, or a gradient is not of that buffer.
     """
     updates, runs = x.shape[:2]
     members[0].check(x, target, updates, runs)
+    if len(members) % runs:
+        raise ValueError(f"{len(members)} members are not those of {runs} runs; give as many for each run")
     structs = (Dynamics * len(members))(*(member.call.struct for member in members))
+    check_alike([*structs], step, x.dtype)
     losses = members[0].call.result(updates, len(members))
     for m, struct in enumerate(structs):
         run = m * runs // len(members)

@@ -501,7 +501,7 @@ struct Weights {
 // together. Nobody's bits depend on that.
 //
 // `once` computes the gradients of one of the structures, moved to the rows of an update, in its memory, with a step of Adam;
-// without memory it counts. Returned is how many numbers are needed in `scratch`; if that is null, nothing is done.
+// without memory it counts. Without `scratch` nothing is done, and the numbers that are needed there are returned.
 template <class T, class Networks, class Once>
 int64_t updates_of(const Networks* all, int64_t count, int64_t updates, const Adam& adam, T* scratch, Once once) {
   const int64_t threads = all->team == nullptr ? 1 : all->threads, apart = count / threads * threads;

@@ -90,6 +90,7 @@ class Call:
         """Address of memory for so many numbers, which is kept; it begins with a line of the processor's cache."""
         if len(self._scratch) < (wanted := numbers + 64 // self._like.element_size()):
             self._scratch = self._like.new_zeros(wanted)
+            self.struct.scratch = None  # it lay in what is gone now
         return (self._scratch.data_ptr() + 63) // 64 * 64
 
     def result(self, *shape: int) -> Tensor:
@@ -146,6 +147,28 @@ def check_gradients(networks: Sequence[Network], gradients: Sequence[Tensor]) ->
         raise ValueError(f"{len(gradients)} gradients for {len(wanted)} weights and biases; give one for each")
     for part, gradient in zip(wanted, gradients):
         check_tensor("a gradient", gradient, tuple(part.shape), part.dtype)
+
+
+def check_alike(structs: Sequence[Sac | Dynamics], step: AdamStep, numbers: torch.dtype) -> None:
+    """Refuse networks that do not share one size, or gradients that Adam's step does not read, by a ValueError."""
+    room = range(step.gradient, step.gradient + step.count * numbers.itemsize)
+    first = _sizes(structs[0])
+    for struct in structs:
+        if (found := _sizes(struct)) != first:
+            raise ValueError(f"networks have batch, threads and layers {found} and {first}; give them the same ones")
+        if not all(layer.weight_gradient in room and layer.bias_gradient in room for layer in _layers(struct)):
+            raise ValueError("a gradient lies outside of the flat buffer that the step of Adam reads; cut it from that")
+
+
+def _layers(struct: Sac | Dynamics) -> list[Layer]:
+    """All layers that learn."""
+    if isinstance(struct, Dynamics):
+        return struct.layer[: struct.layers]
+    return struct.policy[: struct.policy_layers] + struct.critic[: struct.critics * struct.critic_layers]
+
+
+def _sizes(struct: Sac | Dynamics) -> tuple[Any, ...]:
+    return struct.batch, struct.threads, [(layer.inputs, layer.outputs) for layer in _layers(struct)]
 
 
 def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:

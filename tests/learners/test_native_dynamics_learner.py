@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
 from toy_learners import Rows, dynamics_learner, sac_learner
 
 from coim import DynamicsLearner
+from coim.learners import dynamics, sac
 from coim.objectives import native_gradients
 from coim.products import kind_of_processor
 
@@ -59,6 +63,44 @@ def test_who_looks_on_at_a_step_of_adam_sees_every_one_of_native_updates(make_ro
     torch.testing.assert_close(weights_of(learner), weights_of(alone), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("kind", "module", "counts"), [(dynamics_learner, dynamics, [16, 16, 16, 12]), (sac_learner, sac, [50, 10])]
+)
+def test_updates_are_native_as_a_whole_fifty_networks_in_a_call(
+    make_rows: Rows, monkeypatch: pytest.MonkeyPatch, kind: Callable[..., Any], module: Any, counts: list[int]
+) -> None:
+    name = "dynamics_updates" if module is dynamics else "sac_updates"
+    real, calls = getattr(module, name), []
+
+    def told(*arguments: Any, **settings: Any) -> torch.Tensor:
+        calls.append(len(losses := real(*arguments, **settings)))
+        return losses
+
+    monkeypatch.setattr(module, name, told)
+    learner = kind(compile=True)
+    learner.update(make_rows(60, 8))
+    assert calls == counts
+    learner.optimiser.register_step_post_hook(lambda *_: None)
+    learner.update(make_rows(60, 8))
+    assert calls == counts
+
+
+@pytest.mark.parametrize(("kind", "module"), [(dynamics_learner, dynamics), (sac_learner, sac)])
+def test_steps_of_a_call_that_fails_are_not_counted(
+    make_rows: Rows, monkeypatch: pytest.MonkeyPatch, kind: Callable[..., Any], module: Any
+) -> None:
+    learner = kind(compile=True)
+    learner.update(make_rows(2, 8))
+
+    def full(*_: Any, **__: Any) -> torch.Tensor:
+        raise MemoryError
+
+    monkeypatch.setattr(module, "dynamics_updates" if module is dynamics else "sac_updates", full)
+    with pytest.raises(MemoryError):
+        learner.update(make_rows(4, 8))
+    assert learner.optimiser.moments()["step"] == 2
+
+
 def test_layers_that_leave_the_cache_are_learnt_as_others(make_rows: Rows, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of more numbers than ``WIDE`` in ``native_networks.h``, rows in one block, in several, in a ragged one."""
     monkeypatch.setattr(native_gradients, "UP_TO_IN_ENSEMBLES", {kind_of_processor(): 512})
@@ -75,7 +117,9 @@ def test_layers_that_leave_the_cache_are_learnt_as_others(make_rows: Rows, monke
 
 @pytest.mark.parametrize("num_runs", [1, 2, 3])
 @pytest.mark.parametrize("kind", [dynamics_learner, sac_learner])
-def test_native_updates_have_the_same_bits_on_any_number_of_threads(make_rows: Rows, kind: type, num_runs: int) -> None:
+def test_native_updates_have_the_same_bits_on_any_number_of_threads(
+    make_rows: Rows, kind: Callable[..., Any], num_runs: int
+) -> None:
     """Whether each takes networks of its own, all share one, or both by turns: 3 to 9 members, 1 to 3 runs."""
     before, found = torch.get_num_threads(), []
     try:

@@ -14,11 +14,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from coim.learners.captured import FlatAdam
+from coim.learners.flat_weights import views
 from coim.native import Source, find_compiler, team
 from coim.objectives import native_gradients
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
-from coim.objectives.native_gradients import SOURCE, UP_TO, UP_TO_IN_ENSEMBLES, NativeDynamics, NativeSAC, pays
+from coim.objectives.native_gradients import (
+    SOURCE,
+    UP_TO,
+    UP_TO_IN_ENSEMBLES,
+    NativeDynamics,
+    NativeSAC,
+    dynamics_updates,
+    pays,
+)
 from coim.objectives.native_structures import AdamStep, Dynamics, Layer, Sac
 from coim.products import kind_of_processor
 
@@ -242,6 +252,45 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
     case = Case(SIZES[3], torch.bfloat16)
     with pytest.raises(TypeError, match=r"native gradients are of float32 or float64, not of torch.bfloat16; set"):
         case.found()
+
+
+def members_in_one_buffer(*cells: int, threads: int = 1) -> tuple[list[NativeDynamics], Tensor, FlatAdam, Tensor]:
+    """Members with so many hidden units each, their rows and targets, and Adam over all weights."""
+    rng, x, target = torch.Generator().manual_seed(0), torch.randn(16, 7), torch.randn(16, 3)
+    drawn = [network(rng, 7, number, number, 6, dtype=torch.float32) for number in cells]
+    parts = [part for one in drawn for part in chain(*zip(one.weights, one.biases))]
+    weights = torch.nn.Parameter(torch.cat([part.reshape(-1) for part in parts]))
+    weights.grad = torch.zeros_like(weights)
+    own, gradients = (views(flat, parts) for flat in (weights.detach(), weights.grad))
+    natives = []
+    for at in range(0, len(parts), 6):
+        one = Network(own[at : at + 6 : 2], own[at + 1 : at + 6 : 2])
+        natives.append(NativeDynamics(one, gradients[at : at + 6], x, target, log_var_range=BOUNDS, threads=threads))
+    return natives, x, FlatAdam([weights], lr=1e-3), target
+
+
+def test_a_member_that_updates_with_others_goes_on_alone() -> None:
+    """They need more memory together."""
+    members, x, adam, target = members_in_one_buffer(64, 64, 64, 64, threads=2)
+    first = members[0](x, target)
+    found = [dynamics_updates(members, x[None, None], target[None, None], adam.as_native())[0, 0] for _ in range(2)]
+    assert torch.equal(found[0], first[0])
+    assert members[0](x, target) < found[1] < first
+    assert members[0].call.struct.scratch - members[0].call._scratch.data_ptr() < 64
+
+
+def test_members_that_do_not_fit_together_are_refused() -> None:
+    members, x, adam, target = members_in_one_buffer(8, 8, 8)
+    rows = x[None, None], target[None, None]
+    others = members_in_one_buffer(8, 9)[0]
+    with pytest.raises(ValueError, match=r"batch, threads and layers \(16, 1, .* give them the same ones"):
+        dynamics_updates([members[0], others[1]], *rows, adam.as_native())
+    with pytest.raises(ValueError, match="a gradient lies outside of the flat buffer that the step of Adam reads"):
+        dynamics_updates([members[0], others[0]], *rows, adam.as_native())
+    with pytest.raises(ValueError, match="3 members are not those of 2 runs; give as many for each run"):
+        dynamics_updates(
+            members, x.expand(1, 2, -1, -1).contiguous(), target.expand(1, 2, -1, -1).contiguous(), adam.as_native()
+        )
 
 
 def test_wide_layers_are_left_to_the_libraries() -> None:
