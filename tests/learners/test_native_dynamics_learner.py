@@ -102,7 +102,7 @@ def test_steps_of_a_call_that_fails_are_not_counted(
 
 
 def test_layers_that_leave_the_cache_are_learnt_as_others(make_rows: Rows, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of more numbers than ``WIDE`` in ``native_networks.h``, rows in one block, in several, in a ragged one."""
+    """Layers have more numbers than ``WIDE`` in ``native_networks.h``; rows fill a block, several, and a ragged one."""
     monkeypatch.setattr(native_gradients, "UP_TO_IN_ENSEMBLES", {kind_of_processor(): 512})
     native, plain = (
         seen(dynamics_learner(compile=compile, num_cells=(400, 400)), make_rows(20, 32)) for compile in (True, False)

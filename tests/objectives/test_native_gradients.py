@@ -14,9 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from coim.learners.captured import FlatAdam
-from coim.learners.flat_weights import views
-from coim.native import Source, find_compiler, team
+from coim.native import find_compiler, team
 from coim.objectives import native_gradients
 from coim.objectives.dynamics_gradients import dynamics_gradients
 from coim.objectives.gradients import Batch, Network, SACGradients, sac_gradients
@@ -26,7 +24,6 @@ from coim.objectives.native_gradients import (
     UP_TO_IN_ENSEMBLES,
     NativeDynamics,
     NativeSAC,
-    dynamics_updates,
     pays,
 )
 from coim.objectives.native_structures import AdamStep, Dynamics, Layer, Sac
@@ -254,45 +251,6 @@ def test_networks_and_gradients_that_do_not_fit_are_refused() -> None:
         case.found()
 
 
-def members_in_one_buffer(*cells: int, threads: int = 1) -> tuple[list[NativeDynamics], Tensor, FlatAdam, Tensor]:
-    """Members with so many hidden units each, their rows and targets, and Adam over all weights."""
-    rng, x, target = torch.Generator().manual_seed(0), torch.randn(16, 7), torch.randn(16, 3)
-    drawn = [network(rng, 7, number, number, 6, dtype=torch.float32) for number in cells]
-    parts = [part for one in drawn for part in chain(*zip(one.weights, one.biases))]
-    weights = torch.nn.Parameter(torch.cat([part.reshape(-1) for part in parts]))
-    weights.grad = torch.zeros_like(weights)
-    own, gradients = (views(flat, parts) for flat in (weights.detach(), weights.grad))
-    natives = []
-    for at in range(0, len(parts), 6):
-        one = Network(own[at : at + 6 : 2], own[at + 1 : at + 6 : 2])
-        natives.append(NativeDynamics(one, gradients[at : at + 6], x, target, log_var_range=BOUNDS, threads=threads))
-    return natives, x, FlatAdam([weights], lr=1e-3), target
-
-
-def test_a_member_that_updates_with_others_goes_on_alone() -> None:
-    """They need more memory together."""
-    members, x, adam, target = members_in_one_buffer(64, 64, 64, 64, threads=2)
-    first = members[0](x, target)
-    found = [dynamics_updates(members, x[None, None], target[None, None], adam.as_native())[0, 0] for _ in range(2)]
-    assert torch.equal(found[0], first[0])
-    assert members[0](x, target) < found[1] < first
-    assert members[0].call.struct.scratch - members[0].call._scratch.data_ptr() < 64
-
-
-def test_members_that_do_not_fit_together_are_refused() -> None:
-    members, x, adam, target = members_in_one_buffer(8, 8, 8)
-    rows = x[None, None], target[None, None]
-    others = members_in_one_buffer(8, 9)[0]
-    with pytest.raises(ValueError, match=r"batch, threads and layers \(16, 1, .* give them the same ones"):
-        dynamics_updates([members[0], others[1]], *rows, adam.as_native())
-    with pytest.raises(ValueError, match="a gradient lies outside of the flat buffer that the step of Adam reads"):
-        dynamics_updates([members[0], others[0]], *rows, adam.as_native())
-    with pytest.raises(ValueError, match="3 members are not those of 2 runs; give as many for each run"):
-        dynamics_updates(
-            members, x.expand(1, 2, -1, -1).contiguous(), target.expand(1, 2, -1, -1).contiguous(), adam.as_native()
-        )
-
-
 def test_wide_layers_are_left_to_the_libraries() -> None:
     assert pays([torch.zeros(1000, 256), torch.zeros(256)])
     assert not pays([torch.zeros(10, 257), torch.zeros(257)])
@@ -351,52 +309,6 @@ def test_nothing_is_written_beside_the_gradients() -> None:
     assert all(wide[-64:].isnan().all() and not wide[:-64].isnan().any() for wide in guards)
     for own, right in zip(gradients, case.found()[0]):
         assert torch.equal(own, right)
-
-
-def test_a_compiler_that_does_not_know_what_is_wished_for_does_without(tmp_path: Path) -> None:
-    compiler = tmp_path / "c++"
-    compiler.write_text(
-        '#!/bin/sh\nfor word; do case $word in -fvect*) echo "unknown $word" >&2; exit 1;; esac; done\n'
-        f'exec {find_compiler("install one")} "$@"\n'
-    )
-    compiler.chmod(0o755)
-    command, _ = SOURCE.command(str(compiler))
-    assert not {*SOURCE.wished} & {*command}
-    assert {*SOURCE.options} <= {*command}
-
-
-def test_a_changed_header_is_compiled_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    path, header = tmp_path / "source.cpp", tmp_path / "number.h"
-    path.write_text('#include "number.h"\nextern "C" int number() { return NUMBER; }\n')
-    source = Source(path=path, headers=(header,), options=(), purpose="numbers", way_out="guess")
-    for number in (7, 8):
-        header.write_text(f"#define NUMBER {number}\n")
-        assert source.library().number() == number
-
-
-def test_each_processor_compiler_option_and_version_has_code_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A folder may serve several machines, whose compilers predefine what their processors can do."""
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    path, compiler = tmp_path / "source.cpp", tmp_path / "c++"
-    path.write_text('extern "C" int number() { return MACHINE; }\n')
-    source = Source(path=path, options=("-O1",), purpose="numbers", way_out="guess")
-
-    def number_on(machine: int, source: Source) -> int:
-        compiler.write_text(f'#!/bin/sh\nexec {find_compiler("")} -DMACHINE={machine} "$@"\n')
-        compiler.chmod(0o755)
-        with monkeypatch.context() as patch:
-            patch.setenv("CXX", str(compiler))
-            return source.library().number()
-
-    assert [number_on(machine, source) for machine in (1, 2, 1)] == [1, 2, 1]
-    assert len([*tmp_path.rglob("*.so")]) == 2
-    for other in (replace(source, options=("-O2",)), replace(source, made_from="MuJoCo 4")):
-        before = len([*tmp_path.rglob("*.so")])
-        assert number_on(1, other) == 1
-        assert len([*tmp_path.rglob("*.so")]) == before + 1
 
 
 def test_every_header_that_is_included_is_named() -> None:
