@@ -85,7 +85,7 @@ $(GPU_STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv --system-site-packages $(GPU_VENV)
 	$(PYTHON) -c 'import pathlib, torch; print(pathlib.Path(torch.__file__).parents[1])' > "$$($(GPU_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/torch_there.pth"
 	$(GPU_PIP) 'setuptools >= 68'
-	$(GPU_PIP) --no-build-isolation -e . tyro pydantic pytest
+	$(GPU_PIP) --no-build-isolation -e '.[warp]' tyro pydantic pytest
 	@touch $@
 
 clean:

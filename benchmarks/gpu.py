@@ -1,8 +1,9 @@
 """``make gpu``: what holds on a GPU, and how fast it is, in one JSON.
 
-The tests marked ``gpu``, a short fleet whose first episode is compared with the CPU's, and the rows "update" and
-"iteration" of the benchmarks for fleets of several sizes. The JSON is written after each part, so that whoever is
-stopped has what there was. ``--rehearse`` takes the same way on a CPU at tiny sizes.
+The tests marked ``gpu``, a short fleet whose first episode is compared with the CPU's, the rows "update" and
+"iteration" of the benchmarks for fleets of several sizes, and physics by MuJoCo Warp beside those of the host. The
+JSON is written after each part, so that whoever is stopped has what there was. ``--rehearse`` takes the same way on a
+CPU at tiny sizes.
 """
 
 from __future__ import annotations
@@ -30,11 +31,14 @@ from benchmarks.missing import missing
 from benchmarks.parts import replay
 from benchmarks.table import machine
 from benchmarks.updates import our_updates
+from benchmarks.warp import missing as lacks_warp
+from benchmarks.warp import physics
 from coim import CoAdaptation, EpisodeDone, HopperMorph
 from coim.experiments.run.build import build
 from coim.experiments.run.machine import available_cores, prepare
 from coim.experiments.run.settings import Settings
 
+WALKING = ("half_cheetah", "walker", "hopper", "ant")
 EFFORT = Effort(repeats=5, long_repeats=2, runs=(1, 16, 64, 256), fleets=(1, 16, 64), updates=100)
 TINY = Effort(
     repeats=1,
@@ -49,6 +53,7 @@ TINY = Effort(
     population_updates=2,
     model_updates=2,
     episode_steps=8,
+    fleet_steps=8,
 )
 FLEET = Settings(
     num_runs=32,
@@ -99,6 +104,11 @@ def main(options: Options) -> None:
         **{f"update, K = {runs}": lambda runs=runs: update(effort, runs, device) for runs in effort.runs},
         **{f"small update, K = {runs}": lambda runs=runs: update(small, runs, device) for runs in effort.runs},
         **{f"iteration, K = {runs}": lambda runs=runs: iteration(effort, runs, device) for runs in effort.fleets},
+        **{
+            f"physics, {name}, K = {runs}": lambda name=name, runs=runs: stepped(name, runs, effort, device)
+            for name in WALKING
+            for runs in effort.runs[1:]
+        },
     }
     found: Result = {"machine": machine() | described(device), "rehearsal": options.rehearse, "parts": {}}
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -273,6 +283,12 @@ def iteration(effort: Effort, runs: int, device: torch.device) -> Result:
         )
         for name, run in actions.items()
     )
+
+
+def stepped(name: str, runs: int, effort: Effort, device: torch.device) -> Result:
+    """Physics on the device beside that of the host, where MuJoCo Warp is installed."""
+    lack = lacks_warp()
+    return {"holds": True, "left out": lack} if lack else rows(physics(name, runs, effort, device))
 
 
 def rows(figures: Any) -> Result:

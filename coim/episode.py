@@ -22,6 +22,7 @@ from coim.envs.designed_env import check_rewards
 from coim.envs.fleet import Fleet
 from coim.envs.morph import MorphEnv
 from coim.envs.native_episode import Actor, Rows, play
+from coim.envs.simulation import Simulations
 from coim.models.policy import LOG_SCALE_RANGE, Policy, PolicyNetwork
 from coim.randomness import drawing_from
 
@@ -133,7 +134,9 @@ def run_episode(
 
 
 def _native(env: MorphEnv, network: PolicyNetwork, design: Tensor) -> Actor | None:
-    """The policies as native code reads them, or None where it cannot: the bodies see or move in a way of their own."""
+    """The policies as native code reads them, or None where it cannot: bodies see or move in a way of their own."""
+    if type(env.simulations) is not Simulations:
+        return None
     for name in ("move", "_see"):
         if getattr(type(env), name) is not getattr(Fleet, name) or name in vars(env):
             return None

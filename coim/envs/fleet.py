@@ -1,6 +1,6 @@
 """A fleet of simulated bodies with tensors as inputs and outputs, without TorchRL.
 
-Shapes: K runs (rows of the fleet), S observation, D design, A action. All simulations run on the CPU.
+Shapes: K runs (rows of the fleet), S observation, D design, A action.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -37,11 +38,11 @@ class Fleet(Robot):
 
     reset_noise: float
 
-    def _begin(self, num_runs: int, num_threads: int) -> None:
-        """Build K unit bodies."""
-        self._num_threads = num_threads
+    def _begin(self, num_runs: int, **simulated: Any) -> None:
+        """Build K unit bodies, simulated as :meth:`_simulate` takes it."""
+        self._simulated = simulated
         self._design = torch.ones(num_runs, self.DESIGN_SIZE, dtype=torch.float32, device="cpu")
-        self.simulations = self._simulate(self._design.numpy(), num_threads)
+        self.simulations = self._simulate(self._design.numpy(), **simulated)
         model = self.simulations.model(0)
         self.root = read_root(model, type(self).__name__)
         low, high = model.actuator_ctrlrange.T

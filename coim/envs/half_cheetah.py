@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from coim.envs.morph import MorphEnv
-from coim.envs.robot import uniform_and_normal
+from coim.envs.robot import Physics, uniform_and_normal
 from coim.envs.task import Task, speed_along
 
 LEGS = (("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot"))
@@ -105,6 +105,7 @@ class HalfCheetahMorph(MorphEnv):
         seed: int | None = None,
         num_threads: int = 1,
         device: torch.device | str | None = None,
+        physics: Physics = "mujoco",
         segment_lengths: Sequence[float] = SEGMENT_LENGTHS,
     ) -> None:
         lengths = np.asarray(segment_lengths, dtype=np.float64)
@@ -121,6 +122,7 @@ class HalfCheetahMorph(MorphEnv):
             seed=seed,
             num_threads=num_threads,
             device=device,
+            physics=physics,
         )
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:

@@ -15,7 +15,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from numbers import Integral
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from coim.envs.designed_env import (
     leave_idle,
 )
 from coim.envs.fleet import Fleet
+from coim.envs.robot import Physics
 from coim.envs.task import Task, speed_along
 
 DONE_KEYS = ("done", "terminated", "truncated")
@@ -72,7 +73,10 @@ class MorphEnv(Fleet, DesignedEnv):
         seed: seed of the reset noise; each row has its own generator, derived from (seed, row). Drawn from torch's
             global generator if None.
         num_threads: native threads that share the rows. They do not change the results.
-        device: device of the tensors, torch's default device if None. The simulations always run on the CPU.
+        device: device of the tensors, torch's default device if None.
+        physics: ``mujoco`` computes on the CPU in float64, and gives the same bits each time. ``warp`` is MuJoCo Warp:
+            the device steps all bodies at once, in float32, and **not bit for bit the same** the next time; episodes
+            are never native with it. It needs ``pip install 'coim[warp]'``.
 
     Attributes:
         simulations: the simulations themselves: live positions and velocities, and the compiled bodies.
@@ -82,6 +86,8 @@ class MorphEnv(Fleet, DesignedEnv):
         ValueError: if an argument is out of range, the device does not exist, the names or bounds of the design or the
             scale of the observation do not fit, the body is none that `coim.envs.root` knows, or the reward is not
             ``[*B, 1]``.
+        ImportError: if MuJoCo Warp is asked for and not installed.
+        NotImplementedError: if MuJoCo Warp does not know a part of the body.
 
     Example:
         >>> from coim import HopperMorph
@@ -102,7 +108,10 @@ class MorphEnv(Fleet, DesignedEnv):
         seed: int | None = None,
         num_threads: int = 1,
         device: torch.device | str | None = None,
+        physics: Physics = "mujoco",
     ) -> None:
+        if physics not in get_args(Physics):
+            raise ValueError(f"physics {physics!r} is neither 'mujoco' nor 'warp'")
         for name, count in (("num_runs", num_runs), ("episode_steps", episode_steps), ("num_threads", num_threads)):
             if isinstance(count, bool) or not isinstance(count, Integral) or count < 1:
                 raise ValueError(f"{name} {count!r} is not a whole number of at least 1")
@@ -116,7 +125,7 @@ class MorphEnv(Fleet, DesignedEnv):
                 f"reset_noise {self.reset_noise} is not a finite number of at least 0; 0 gives a start without noise"
             )
         super().__init__(device=_existing(device), batch_size=torch.Size([num_runs]))
-        self._begin(num_runs, num_threads)
+        self._begin(num_runs, num_threads=num_threads, physics=physics, device=str(self.device or "cpu"))
         self._make_specs()
         self._check_numbers()
         self.set_seed(int(torch.randint(2**31, (), device="cpu")) if seed is None else seed)
@@ -198,7 +207,7 @@ class MorphEnv(Fleet, DesignedEnv):
     def __setstate__(self, state: dict[str, Any]) -> None:
         simulation_state = state.pop("simulation_state")
         super().__setstate__(state)
-        self.simulations = self._simulate(self._design.numpy(), self._num_threads)
+        self.simulations = self._simulate(self._design.numpy(), **self._simulated)
         self._seed_rows(0)  # makes the generators; set_simulation_state restores their states
         self.set_simulation_state(simulation_state)
 

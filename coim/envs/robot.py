@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import re
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -23,6 +23,7 @@ from coim.envs.segments import Scale, Segments, keep_densities
 from coim.envs.simulation import Simulations
 
 Bounds = tuple[float, float] | tuple[tuple[float, float], ...]
+Physics = Literal["mujoco", "warp"]
 
 
 def uniform_and_normal(num_positions: int, num_velocities: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -54,7 +55,9 @@ class Robot:
     root: Root
     _observes_place = False  # whether the robot's place on the ground is observed
 
-    def _simulate(self, designs: np.ndarray, num_threads: int) -> Simulations:
+    def _simulate(
+        self, designs: np.ndarray, num_threads: int, *, physics: Physics = "mujoco", device: str = "cpu"
+    ) -> Simulations:
         """Make the simulations of the bodies of designs ``[K, D]``."""
         drawn = mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / self.ASSET))
         if self.SCALE:
@@ -62,12 +65,12 @@ class Robot:
         give_floor(drawn)
         if self.SCALE:
             self._segments = Segments(drawn, self.SCALE)
-        return Simulations(
-            drawn,
-            shape_body=self.shape_body,
-            designs=designs,
-            num_threads=num_threads,
-        )
+        how: dict[str, Any] = {"shape_body": self.shape_body, "designs": designs, "num_threads": num_threads}
+        if physics == "mujoco":
+            return Simulations(drawn, **how)
+        from coim.envs.warp_simulations import WarpSimulations
+
+        return WarpSimulations(drawn, device=device, **how)
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
         """Change the body at xi = 1 into the body of a design, in place; by default as ``SCALE`` says.

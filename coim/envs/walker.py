@@ -19,6 +19,7 @@ from torch import Tensor
 
 from coim.angles import wrap_angle
 from coim.envs.morph import MorphEnv
+from coim.envs.robot import Physics
 from coim.envs.task import Task, speed_along
 
 HEIGHT, PITCH_ANGLE, FORWARD_VELOCITY = -17, -16, -9  # entries of the observation, with or without root x in front
@@ -99,6 +100,7 @@ class WalkerMorph(MorphEnv):
         seed: int | None = None,
         num_threads: int = 1,
         device: torch.device | str | None = None,
+        physics: Physics = "mujoco",
         observe_root_x: bool = True,
     ) -> None:
         self._observes_place = observe_root_x
@@ -110,6 +112,7 @@ class WalkerMorph(MorphEnv):
             seed=seed,
             num_threads=num_threads,
             device=device,
+            physics=physics,
         )
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:

@@ -14,14 +14,17 @@ from benchmarks import gpu
 from benchmarks.gpu import Options, main
 
 ROWS = {f"{row}, K = {runs}" for row in ("update", "small update", "iteration") for runs in (1, 2)}
+PHYSICS = {f"physics, {name}, K = 2" for name in ("half_cheetah", "walker", "hopper", "ant")}
 
 
 def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "marked_tests", lambda seconds: {"holds": True, "tests": 0})
+    monkeypatch.setattr(gpu, "lacks_warp", lambda: "not installed")  # on a CPU its kernels take a minute to compile
     main(Options(rehearse=True, out=tmp_path / "runs" / "gpu.json"))
     found = json.loads((tmp_path / "runs" / "gpu.json").read_text())
     assert found["rehearsal"]
-    assert found["parts"].keys() == {"tests", "fleet"} | ROWS
+    assert found["parts"].keys() == {"tests", "fleet"} | ROWS | PHYSICS
+    assert all(found["parts"][name]["left out"] == "not installed" for name in PHYSICS)
     assert found["parts"]["fleet"]["largest difference of an observation"] == 0  # of the CPU from the CPU
     assert found["parts"]["fleet"]["designs"] == 3
     assert all(figure["ratio"]["median"] > 0 for name in ROWS for figure in found["parts"][name]["figures"])
@@ -52,7 +55,7 @@ def test_a_part_that_fails_or_comes_too_late_is_told_and_the_others_go_on(
     def broken(*_: object) -> gpu.Result:
         raise RuntimeError("no kernel image")
 
-    for name in ("marked_tests", "fleet", "update", "iteration"):
+    for name in ("marked_tests", "fleet", "update", "iteration", "stepped"):
         monkeypatch.setattr(gpu, name, broken if name == "fleet" else lambda *_: {"holds": True})
     out = tmp_path / "gpu.json"
     with pytest.raises(SystemExit, match="not well: fleet; see"):
