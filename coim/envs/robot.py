@@ -21,6 +21,7 @@ from coim.envs.kinematics import Kinematics
 from coim.envs.root import Root, give_floor
 from coim.envs.segments import Scale, Segments, keep_densities
 from coim.envs.simulation import Simulations
+from coim.envs.warp_simulations import WarpSimulations
 
 Bounds = tuple[float, float] | tuple[tuple[float, float], ...]
 Physics = Literal["mujoco", "warp"]
@@ -68,8 +69,6 @@ class Robot:
         how: dict[str, Any] = {"shape_body": self.shape_body, "designs": designs, "num_threads": num_threads}
         if physics == "mujoco":
             return Simulations(drawn, **how)
-        from coim.envs.warp_simulations import WarpSimulations
-
         return WarpSimulations(drawn, device=device, **how)
 
     def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:

@@ -23,26 +23,12 @@ import numpy as np
 from coim.envs.root import colliding
 from coim.envs.simulation import Simulations
 
-try:
-    import warp
-
-    warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)  # or every kernel that is loaded is a line
-    import mujoco_warp
-except ImportError as error:
-    raise ImportError(
-        f"physics 'warp' is computed by MuJoCo Warp ({error}); pip install 'coim[warp]', or physics='mujoco'"
-    ) from error
-
 MOVING = ("qpos", "qvel", "act", "qacc_warmstart")  # what a step reads and changes
 CONTACTS_OF_A_PART = 4  # of a box that lies on the floor; a capsule has two
 FOR_SLEEP = ("dof_length",)  # worlds share it, and only robots that may fall asleep need it
-LACKS_ROOM = (
-    mujoco_warp.OverflowType.NEFC
-    | mujoco_warp.OverflowType.NJMAX_NNZ
-    | mujoco_warp.OverflowType.BROADPHASE
-    | mujoco_warp.OverflowType.NARROWPHASE
-    | mujoco_warp.OverflowType.CCD
-)
+# Each world could have its own, but what they are decides which kernels there are.
+DECIDING = ("actuator_gainprm", "actuator_biasprm", "actuator_damping", "actuator_dampingpoly", "eq_data")
+LACKS_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD")  # of MuJoCo Warp's OverflowType
 
 
 class WarpSimulations(Simulations):
@@ -52,8 +38,9 @@ class WarpSimulations(Simulations):
         device: as torch names it: ``cuda``, ``cuda:1``, or ``cpu``, which is slow and there to try it.
 
     Raises:
+        ImportError: if MuJoCo Warp is not installed.
         NotImplementedError: if MuJoCo Warp does not know a part of the body; it names the part.
-        ValueError: if bodies differ in something that its worlds share, such as the vertices of a mesh.
+        ValueError: if bodies differ in something of which there is one for all worlds, such as the vertices of a mesh.
 
     Other arguments, attributes and methods are those of :class:`~coim.envs.simulation.Simulations`.
     """
@@ -104,11 +91,13 @@ class Worlds:
         device: as torch names it.
 
     Raises:
+        ImportError: if MuJoCo Warp is not installed.
         NotImplementedError: if MuJoCo Warp does not know a part of the body.
         ValueError: if bodies differ in something that worlds share.
     """
 
     def __init__(self, models: Sequence[mujoco.MjModel], *, device: str) -> None:
+        self._warp, self._mujoco_warp = warp, mujoco_warp = _packages()
         self._device = warp.get_device(device)
         first = models[0]
         fields = {field.name: field.type for field in dataclasses.fields(mujoco_warp.Model)}
@@ -116,13 +105,17 @@ class Worlds:
         own = [
             name
             for name, kind in fields.items()
-            if getattr(kind, "shape", ("",))[:1] == ("*",) and np.size(getattr(first, name, ()))
+            if getattr(kind, "shape", ("",))[:1] == ("*",)
+            and np.size(getattr(first, name, ()))
+            and name not in DECIDING
         ]
         sleeps = first.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
-        known = own if sleeps else [*own, *FOR_SLEEP]
-        self._shared = [
-            name for name in fields if name not in known and isinstance(getattr(first, name, None), np.ndarray)
-        ]
+        differing = own if sleeps else [*own, *FOR_SLEEP]
+        self._shared = {
+            name: np.array(value)
+            for name, value in _values(first).items()
+            if name.startswith("opt.") or (name in fields and name not in differing)
+        }
         parts = int(colliding(first).sum())
         contacts = max(1, CONTACTS_OF_A_PART * parts)
         rows = 2 * (int(first.geom_condim.max()) - 1) or 1  # sides of a friction pyramid
@@ -136,6 +129,7 @@ class Worlds:
                 first, nworld=len(models), nconmax=contacts, njmax=first.njnt + first.nv + rows * contacts
             )
         self._graphs: dict[int, Any] = {}
+        self._lacks_room = sum(int(mujoco_warp.OverflowType[name]) for name in LACKS_ROOM)
 
     def put(self, models: Sequence[mujoco.MjModel]) -> None:
         """Take the bodies of all worlds; captured steps read them where they lie.
@@ -143,11 +137,14 @@ class Worlds:
         Raises:
             ValueError: if bodies differ in something that worlds share. The bodies stay as they were.
         """
-        for name in self._shared:
-            if any(not np.array_equal(getattr(model, name), getattr(models[0], name)) for model in models[1:]):
-                raise ValueError(
-                    f"the bodies differ in {name!r}, of which MuJoCo Warp has one for all worlds; take physics='mujoco'"
-                )
+        for model in models:
+            values = _values(model)
+            for name, value in self._shared.items():
+                if not np.array_equal(values[name], value):
+                    raise ValueError(
+                        f"a body differs from the first in {name!r}, of which MuJoCo Warp has one for all worlds; take "
+                        "physics='mujoco'"
+                    )
         for name, there in self._own.items():
             rows = np.stack([getattr(model, name) for model in models])
             there.assign(rows.reshape(there.numpy().shape))
@@ -164,21 +161,21 @@ class Worlds:
             RuntimeError: if a body touches more than there is room for.
         """
         data = self._data
-        with warp.ScopedDevice(self._device):
+        with self._warp.ScopedDevice(self._device):
             self._bring(moving, ctrl)
             if not self._device.is_cuda:
                 self._advance(num_steps)
             else:
                 if num_steps not in self._graphs:
-                    mujoco_warp.step(self._model, data)  # compiles and loads the kernels, which a capture cannot
-                    with warp.ScopedCapture() as capture:
+                    self._mujoco_warp.step(self._model, data)  # compiles and loads the kernels, which a capture cannot
+                    with self._warp.ScopedCapture() as capture:
                         self._advance(num_steps)
                     self._graphs[num_steps] = capture.graph
                     self._bring(moving, ctrl)
-                warp.capture_launch(self._graphs[num_steps])
+                self._warp.capture_launch(self._graphs[num_steps])
             for name, value in moving.items():
                 value[:] = getattr(data, name).numpy()
-            lacks_room = (data.overflow.numpy() & int(LACKS_ROOM)) != 0
+            lacks_room = (data.overflow.numpy() & self._lacks_room) != 0
         if lacks_room.any():
             raise RuntimeError(
                 f"body {int(lacks_room.argmax())} touches more than MuJoCo Warp was given room for ({data.naconmax} "
@@ -193,7 +190,7 @@ class Worlds:
 
     def _advance(self, num_steps: int) -> None:
         for _ in range(num_steps):
-            mujoco_warp.step(self._model, self._data)
+            self._mujoco_warp.step(self._model, self._data)
 
     def _check_order(self, first: mujoco.MjModel) -> None:
         """Refuse a version of MuJoCo Warp that orders a field in another way than MuJoCo."""
@@ -201,4 +198,25 @@ class Worlds:
             values = there.numpy()
             expected = np.broadcast_to(np.reshape(getattr(first, name), values.shape[1:]), values.shape)
             if not np.array_equal(values, expected.astype(values.dtype)):
-                raise ValueError(f"MuJoCo Warp {mujoco_warp.__version__} keeps {name!r} in an order of its own")
+                raise ValueError(f"MuJoCo Warp {self._mujoco_warp.__version__} keeps {name!r} in an order of its own")
+
+
+def _values(model: mujoco.MjModel) -> dict[str, Any]:
+    """The numbers and arrays of a body, and its options, by name."""
+    fields = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+    options = {f"opt.{name}": getattr(model.opt, name) for name in dir(model.opt) if not name.startswith("_")}
+    return {name: value for name, value in (fields | options).items() if isinstance(value, np.ndarray | int | float)}
+
+
+def _packages() -> tuple[Any, Any]:
+    """Warp and MuJoCo Warp, which the library does without until they are asked for."""
+    try:
+        import warp
+
+        warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)  # or every kernel that is loaded is a line
+        import mujoco_warp
+    except ImportError as error:
+        raise ImportError(
+            f"physics 'warp' is computed by MuJoCo Warp ({error}); pip install 'coim[warp]', or physics='mujoco'"
+        ) from error
+    return warp, mujoco_warp

@@ -105,21 +105,27 @@ def test_episodes_are_not_native(device: str) -> None:
 
 
 @needs_warp
-def test_bodies_that_differ_in_what_worlds_share_are_refused() -> None:
-    class Slippery(HopperMorph):
+@pytest.mark.parametrize("name", ["geom_priority", "opt.timestep", "actuator_biasprm"])
+def test_bodies_that_differ_in_what_worlds_share_are_refused(name: str) -> None:
+    """Alone too: what is shared was taken from the body at xi = 1."""
+
+    class Odd(HopperMorph):
         def shape_body(self, spec: mujoco.MjSpec, design: np.ndarray) -> None:
             super().shape_body(spec, design)
             if design[0] > 1:
-                spec.geoms[-1].priority = 1
+                spec.geoms[-1].priority = name == "geom_priority"
+                spec.option.timestep *= 0.5 if name == "opt.timestep" else 1
+                if name == "actuator_biasprm":
+                    spec.actuators[0].biastype = mujoco.mjtBias.mjBIAS_AFFINE
+                    spec.actuators[0].biasprm[1] = -1
 
-    env = Slippery(num_runs=2, physics="warp", seed=0)
-    before = env.get_simulation_state()
-    longer = torch.tensor([[1.0, 1.0, 1.0, 1.0], [1.5, 1.0, 1.0, 1.0]])
-    with pytest.raises(ValueError, match="bodies differ in 'geom_priority', of which MuJoCo Warp has one for all"):
-        env.reset(TensorDict({"design": longer}, [2]))
-    assert env.simulations.model(1).geom_priority.max() == 0
+    env = Odd(physics="warp", seed=0)
+    before, body = env.get_simulation_state(), env.simulations.model(0)
+    with pytest.raises(ValueError, match=f"differs from the first in '{name}', of which MuJoCo Warp has one for all"):
+        env.reset(TensorDict({"design": torch.tensor([[1.5, 1.0, 1.0, 1.0]])}, [1]))
+    assert env.simulations.model(0) is body
     assert torch.equal(env.get_simulation_state()["design"], before["design"])
-    env.move(torch.zeros(2, 3))
+    env.move(torch.zeros(1, 3))
 
 
 @needs_warp
@@ -137,6 +143,5 @@ def test_other_physics_and_a_missing_package_are_refused(monkeypatch: pytest.Mon
     with pytest.raises(ValueError, match="physics 'bullet' is neither 'mujoco' nor 'warp'"):
         HopperMorph(physics="bullet")
     monkeypatch.setitem(sys.modules, "warp", None)
-    monkeypatch.delitem(sys.modules, "coim.envs.warp_simulations", raising=False)
     with pytest.raises(ImportError, match=r"pip install 'coim\[warp\]', or physics='mujoco'"):
         HopperMorph(physics="warp")
