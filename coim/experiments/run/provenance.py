@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import platform
 import secrets
 import subprocess
@@ -20,11 +21,14 @@ IF_THERE = ("botorch", "gpytorch", "scipy")  # choose bodies by returns
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that the numbers depend on."""
-    found = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    found = {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES}
     for name in IF_THERE:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
+            found[name] = _version(name)
     return found
+
+
+_version = functools.cache(version)  # it parses a long text each time
 
 
 def describe(environment: str, settings: Settings) -> dict[str, Any]:
