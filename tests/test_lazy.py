@@ -15,41 +15,42 @@ import coim
 from coim.lazy import when_imported
 
 PACKAGES = pytest.mark.parametrize("package", ["coim", "coim.designs", "coim.envs"])
-WITHOUT = "import sys; sys.modules.update(mujoco=None, pyswarms=None, gymnasium=None)\n"
 
 
-def python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", WITHOUT + code], capture_output=True, text=True, check=False)
+def python(lines: list[str], *, without: list[str]) -> str:
+    """What a process prints in which some packages are not installed."""
+    lines = [f"import sys; sys.modules.update(dict.fromkeys({without}))", *lines]
+    result = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    return result.stdout
 
 
-def test_losses_networks_learners_buffers_and_the_dream_need_neither_mujoco_nor_pyswarms() -> None:
+def asked_for(name: str, *, package: str = "coim") -> str:
+    """Two lines that print why a name cannot be had."""
+    return f"try: from {package} import {name}\nexcept ImportError as error: print(type(error).__name__, error)"
+
+
+def test_what_needs_neither_mujoco_nor_pyswarms_works_and_the_rest_names_what_is_missing() -> None:
     names = ["CoImSACLoss", "DesignValue", "EnsembleNLLLoss", "GaussianEnsemble", "make_policy", "make_qvalue"]
     names += ["SACLearner", "DynamicsLearner", "TransitionBuffer", "WorldModelEnv", "imagine", "sample_batches"]
     names += ["KnownDesigns", "NoisyDesigns", "RandomDesigns", "GradientSearch"]
     lines = [f"from coim import {name}" for name in names]
     lines += ["from coim.objectives import CoImSACLoss", "from coim.models import make_policy", "import coim.designs"]
-    result = python("\n".join(lines))
-    assert (result.returncode, result.stderr) == (0, "")
+    lines += [asked_for("HopperMorph"), asked_for("ParticleSwarm")]
+    said = python(lines, without=["mujoco", "pyswarms", "gymnasium"]).splitlines()
+    for sentence, missing in zip(said, ("mujoco", "pyswarms"), strict=True):
+        assert sentence.startswith("ModuleNotFoundError")
+        assert missing in sentence
 
 
-@pytest.mark.parametrize(("name", "missing"), [("HopperMorph", "mujoco"), ("ParticleSwarm", "pyswarms")])
-def test_what_needs_a_missing_package_names_it(name: str, missing: str) -> None:
-    said = python(f"from coim import {name}").stderr.splitlines()[-1]
-    assert said.startswith("ModuleNotFoundError")
-    assert missing in said
-
-
-@pytest.mark.parametrize("package", ["coim", "coim.designs"])
-def test_without_an_optional_package_all_other_names_can_be_had(package: str) -> None:
-    lines = [
-        "import sys; sys.modules.update(botorch=None)",
-        f"from {package} import *",
-        "GradientSearch",
-        "wanted = ''",
-    ]
-    lines += [f"try: from {package} import DesignPosterior\nexcept ImportError as error: print(error)"]
-    result = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
-    assert result.stdout == "DesignPosterior needs BoTorch, which is optional: pip install 'coim[posterior]'\n"
+def test_without_botorch_all_other_names_can_be_had_and_the_posterior_says_what_to_install() -> None:
+    packages = ("coim", "coim.designs")
+    lines = ["from coim import CoAdaptation, TrustRegion"]
+    for package in packages:
+        lines += [f"from {package} import *", "GradientSearch", "del GradientSearch"]
+        lines += [asked_for("DesignPosterior", package=package)]
+    said = python(lines, without=["botorch", "gpytorch", "linear_operator"]).splitlines()
+    assert said == ["ImportError DesignPosterior needs BoTorch, which is optional: pip install 'coim[posterior]'"] * 2
 
 
 @PACKAGES
