@@ -44,7 +44,9 @@ print(rows.batch_size, losses["loss_qvalue"].shape)
 #
 #     coim run walker --num-runs 10 --device cuda
 #
-# The simulations always run on the CPU. On a GPU fifty updates are captured once as a CUDA graph and then replayed,
+# The simulations of a run are computed on the CPU. An environment of your own may have them on the GPU, by
+# ``HopperMorph(num_runs=256, physics="warp", device="cuda")``: in float32, and not bit for bit the same the next time
+# (see :doc:`/hardware`). On a GPU fifty updates are captured once as a CUDA graph and then replayed,
 # because small networks would otherwise wait for Python. If the replay does not fit into the GPU's memory, add
 # ``--replay-device cpu``.
 #
