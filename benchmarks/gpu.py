@@ -34,11 +34,11 @@ from benchmarks.updates import our_updates
 from benchmarks.warp import missing as lacks_warp
 from benchmarks.warp import physics
 from coim import CoAdaptation, EpisodeDone, HopperMorph
+from coim.envs import BODIES
 from coim.experiments.run.build import build
 from coim.experiments.run.machine import available_cores, prepare
 from coim.experiments.run.settings import Settings
 
-WALKING = ("half_cheetah", "walker", "hopper", "ant")
 EFFORT = Effort(repeats=5, long_repeats=2, runs=(1, 16, 64, 256), fleets=(1, 16, 64), updates=100)
 TINY = Effort(
     repeats=1,
@@ -106,7 +106,7 @@ def main(options: Options) -> None:
         **{f"iteration, K = {runs}": lambda runs=runs: iteration(effort, runs, device) for runs in effort.fleets},
         **{
             f"physics, {name}, K = {runs}": lambda name=name, runs=runs: stepped(name, runs, effort, device)
-            for name in WALKING
+            for name in BODIES
             for runs in effort.runs[1:]
         },
     }

@@ -15,7 +15,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -48,16 +48,8 @@ class WarpSimulations(Simulations):
     Other arguments, attributes and methods are those of :class:`~coim.envs.simulation.Simulations`.
     """
 
-    def __init__(
-        self,
-        drawn: mujoco.MjSpec,
-        *,
-        shape_body: Callable[[mujoco.MjSpec, np.ndarray], None],
-        designs: np.ndarray,
-        num_threads: int,
-        device: str,
-    ) -> None:
-        super().__init__(drawn, shape_body=shape_body, designs=designs, num_threads=num_threads)
+    def __init__(self, drawn: mujoco.MjSpec, *, device: str, **simulated: Any) -> None:
+        super().__init__(drawn, **simulated)
         bound = {name: self._batch.bind(name) for name in MOVING}
         self._host = {name: value for name, value in bound.items() if value.size}
         self._time = self._batch.bind("time")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import gpu
+from benchmarks import gpu, warp
 from benchmarks.gpu import Options, main
 
 ROWS = {f"{row}, K = {runs}" for row in ("update", "small update", "iteration") for runs in (1, 2)}
@@ -28,6 +28,14 @@ def test_the_whole_way_can_be_rehearsed_without_a_gpu(tmp_path: Path, monkeypatc
     assert found["parts"]["fleet"]["largest difference of an observation"] == 0  # of the CPU from the CPU
     assert found["parts"]["fleet"]["designs"] == 3
     assert all(figure["ratio"]["median"] > 0 for name in ROWS for figure in found["parts"][name]["figures"])
+
+
+def test_a_fleet_is_compared_with_that_of_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = warp._fleet
+    monkeypatch.setattr(warp, "_fleet", lambda name, bodies, **how: made(name, bodies))  # MuJoCo on both sides
+    (figure,) = warp.physics("hopper", 2, gpu.TINY, torch.device("cpu"))
+    assert figure.ratio > 0
+    assert figure.note.endswith("largest): 0, 0, 0")
 
 
 def test_what_cannot_be_compiled_is_told_beside_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,7 +49,7 @@ def actions(steps: int) -> Iterator[torch.Tensor]:
 
 
 def largest_difference(env: MorphEnv, truth: MorphEnv, steps: int) -> float:
-    """Of what both see after a step from the same state."""
+    """Largest difference of what both see after a step from the same state."""
     differences = []
     for action in actions(steps):
         truth.set_simulation_state(env.get_simulation_state())
@@ -107,7 +107,7 @@ def test_episodes_are_not_native(device: str) -> None:
 
 
 def robot(folder: Path, xml: str, scale: dict[str, list[str]]) -> type[MorphEnv]:
-    """Whose reward is of no interest."""
+    """A kind of robot, with a reward that is always 0."""
     path = folder / "robot.xml"
     path.write_text(xml)
     return morph_from_mjcf(path, scale, lambda *rows: 0 * rows[0][..., :1])
@@ -176,11 +176,19 @@ def test_what_would_outlast_a_reset_is_refused(kept: dict[str, str], tmp_path: P
 
 
 @needs_warp
+def test_a_device_that_cannot_compute_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"MuJoCo Warp cannot compute on 'meta' .*; take cuda, or cpu"):
+        HopperMorph(physics="warp", device="meta")
+
+
+@needs_warp
 def test_equalities_have_room(tmp_path: Path) -> None:
     welds = "".join(f'<weld site1="nail" site2="{site}"/>' for site in ("elbow", "hand"))
     env = arm(tmp_path, equality=f"<equality>{welds}</equality>")(physics="warp", seed=0)
     env.reset()
     env.move(torch.zeros(1, 1))
+    # Four sides of the pyramids of 16 contacts, a joint with its velocity, and two welds.
+    assert env.simulations._worlds._data.njmax == 4 * 16 + 2 + 2 * 6
 
 
 @needs_warp
@@ -239,6 +247,8 @@ def test_bodies_that_differ_in_what_worlds_share_are_refused(name: str) -> None:
     plain.set_simulation_state(before)
     plain.move(torch.zeros(1, 3))
     assert np.array_equal(env.simulations.state, plain.simulations.state)
+    env.simulations.start(np.arange(1))  # in the pose of the body that it still has
+    assert np.array_equal(env.simulations.qpos[0], body.qpos0)
 
 
 @needs_warp
